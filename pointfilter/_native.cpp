@@ -1,0 +1,476 @@
+// Neighbourhoods, PCA frames and patches of a point cloud, one pass per point, with the GIL released.
+//
+// Everything here works on one contiguous range of centres in the calling thread; the Python side (patches.py) decides
+// who works on which range. No result depends on that split, on the number of threads or on the order of the input: the
+// candidates of a centre are visited in the order of the index, and the index is sorted by (cell, stable id).
+//
+// Built against CPython's stable ABI: one binary serves every Python from 3.11 on.
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+namespace {
+
+constexpr int kKeyBins = 256;      // first digit of the selection by key
+constexpr int kJacobiSweeps = 12;  // three are typical, the loop leaves as soon as the matrix is diagonal
+
+// ---------------------------------------------------------------------------------------------------------------
+// The index: points sorted by (cell, id), one entry a non-empty cell.
+
+struct Index {
+  const double* x;
+  const double* y;
+  const double* z;
+  const uint64_t* ids;
+  int64_t points;
+  const int64_t* cell_keys;    // sorted, unique; key = (cz * ny + cy) * nx + cx
+  const int64_t* cell_starts;  // one longer than cell_keys
+  int64_t cells;
+  double origin[3];
+  double edge;
+  int64_t shape[3];  // nx, ny, nz
+};
+
+struct Run {  // a row of cells along x, as one contiguous range of points
+  int64_t start, stop;
+  double y_low, y_high, z_low, z_high;
+};
+
+// The runs of points that can lie within `radius` of a centre in one cell. Centres come sorted by cell, so the runs are
+// looked up once a cell and not once a point.
+class Neighbourhood {
+ public:
+  Neighbourhood(const Index& index, double radius) : index_(index), radius_(radius) {}
+
+  // Positions (in the index) of all points p with |p - centre| < radius, in index order.
+  const std::vector<int64_t>& around(const double* centre) {
+    locate(centre);
+    members_.clear();
+    const double limit = radius_ * radius_;
+    for (const Run& run : runs_) {
+      const double dy = gap(centre[1], run.y_low, run.y_high);
+      const double dz = gap(centre[2], run.z_low, run.z_high);
+      if (dy * dy + dz * dz >= limit * (1 + 1e-9)) continue;
+      const size_t before = members_.size();
+      members_.resize(before + static_cast<size_t>(run.stop - run.start));
+      int64_t* out = members_.data() + before;
+      size_t found = 0;
+      for (int64_t j = run.start; j < run.stop; ++j) {
+        const double x = index_.x[j] - centre[0], y = index_.y[j] - centre[1], z = index_.z[j] - centre[2];
+        out[found] = j;
+        found += (x * x + y * y + z * z < limit);
+      }
+      members_.resize(before + found);
+    }
+    return members_;
+  }
+
+ private:
+  static double gap(double value, double low, double high) {
+    return value < low ? low - value : (value > high ? value - high : 0.0);
+  }
+
+  int64_t cell_of(double value, int axis) const {
+    const double cell = std::floor((value - index_.origin[axis]) / index_.edge);
+    const double last = static_cast<double>(index_.shape[axis] - 1);
+    return static_cast<int64_t>(std::min(std::max(cell, 0.0), last));
+  }
+
+  void locate(const double* centre) {
+    std::array<int64_t, 6> box;  // the cells that the ball around any point of the centre's cell touches
+    for (size_t axis = 0; axis < 3; ++axis) {
+      const int along = static_cast<int>(axis);
+      const bool outside = centre[axis] < index_.origin[axis] ||
+                           centre[axis] > index_.origin[axis] + index_.edge * static_cast<double>(index_.shape[axis]);
+      if (outside) {
+        box[axis] = cell_of(centre[axis] - radius_, along);
+        box[axis + 3] = cell_of(centre[axis] + radius_, along);
+      } else {
+        const int64_t home = cell_of(centre[axis], along);
+        const int64_t reach = static_cast<int64_t>(std::ceil(radius_ / index_.edge));
+        box[axis] = std::max<int64_t>(home - reach, 0);
+        box[axis + 3] = std::min<int64_t>(home + reach, index_.shape[axis] - 1);
+      }
+    }
+    if (valid_ && box == box_) return;
+    box_ = box;
+    valid_ = true;
+    runs_.clear();
+    const double slack = index_.edge * 1e-6;
+    for (int64_t cz = box[2]; cz <= box[5]; ++cz) {
+      for (int64_t cy = box[1]; cy <= box[4]; ++cy) {
+        const int64_t row = (cz * index_.shape[1] + cy) * index_.shape[0];
+        const int64_t* end = index_.cell_keys + index_.cells;
+        const int64_t* first = std::lower_bound(index_.cell_keys, end, row + box[0]);
+        const int64_t* last = std::upper_bound(first, end, row + box[3]);
+        if (first == last) continue;
+        Run run;
+        run.start = index_.cell_starts[first - index_.cell_keys];
+        run.stop = index_.cell_starts[last - index_.cell_keys];
+        run.y_low = index_.origin[1] + index_.edge * static_cast<double>(cy) - slack;
+        run.y_high = run.y_low + index_.edge + 2 * slack;
+        run.z_low = index_.origin[2] + index_.edge * static_cast<double>(cz) - slack;
+        run.z_high = run.z_low + index_.edge + 2 * slack;
+        runs_.push_back(run);
+      }
+    }
+  }
+
+  const Index& index_;
+  double radius_;
+  bool valid_ = false;
+  std::array<int64_t, 6> box_{};
+  std::vector<Run> runs_;
+  std::vector<int64_t> members_;
+};
+
+// ---------------------------------------------------------------------------------------------------------------
+// Keyed downsampling: every (centre, neighbour) pair has a 64-bit key, the smallest `wanted` keys stay.
+
+uint64_t mix(uint64_t value) {  // Stafford's variant 13 of the MurmurHash3 finaliser
+  value ^= value >> 30;
+  value *= 0xbf58476d1ce4e5b9ULL;
+  value ^= value >> 27;
+  value *= 0x94d049bb133111ebULL;
+  return value ^ (value >> 31);
+}
+
+class Selection {
+ public:
+  // Keeps `wanted` of `members` in their order; the centre itself, when it is a member, always stays.
+  void keep(std::vector<int64_t>& members, const uint64_t* ids, uint64_t centre_id, uint64_t key, size_t wanted) {
+    const size_t count = members.size();
+    keys_.resize(count);
+    const uint64_t base = mix(key ^ mix(centre_id + 0x9e3779b97f4a7c15ULL));
+    uint32_t bins[kKeyBins] = {};
+    for (size_t k = 0; k < count; ++k) {
+      const uint64_t id = ids[members[k]];
+      const uint64_t value = id == centre_id ? 0 : mix(base + id * 0x9e3779b97f4a7c15ULL);
+      keys_[k] = value;
+      ++bins[value >> 56];
+    }
+    size_t below = 0;
+    size_t bin = 0;
+    while (below + bins[bin] < wanted) below += bins[bin++];
+    border_.clear();
+    for (size_t k = 0; k < count; ++k)
+      if (keys_[k] >> 56 == bin) border_.push_back(keys_[k]);
+    const size_t rank = wanted - below - 1;
+    std::nth_element(border_.begin(), border_.begin() + static_cast<std::ptrdiff_t>(rank), border_.end());
+    const uint64_t threshold = border_[rank];
+    size_t equal = 0;  // equal keys are equal ids, that is, points at the same place: take the first ones
+    for (size_t k = 0; k < count; ++k) equal += keys_[k] < threshold;
+    equal = wanted - equal;
+    size_t kept = 0;
+    for (size_t k = 0; k < count; ++k) {
+      bool take = keys_[k] < threshold;
+      if (keys_[k] == threshold && equal > 0) {
+        take = true;
+        --equal;
+      }
+      if (take) members[kept++] = members[k];
+    }
+    members.resize(kept);
+  }
+
+ private:
+  std::vector<uint64_t> keys_;
+  std::vector<uint64_t> border_;
+};
+
+// ---------------------------------------------------------------------------------------------------------------
+// The PCA frame.
+
+// Eigenvectors (columns of v) of a symmetric 3 x 3 matrix by cyclic Jacobi rotations; a is overwritten, its diagonal
+// holds the eigenvalues.
+void jacobi(double a[3][3], double v[3][3]) {
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) v[i][j] = i == j;
+  for (int sweep = 0; sweep < kJacobiSweeps; ++sweep) {
+    const double off = a[0][1] * a[0][1] + a[0][2] * a[0][2] + a[1][2] * a[1][2];
+    const double diagonal = a[0][0] * a[0][0] + a[1][1] * a[1][1] + a[2][2] * a[2][2];
+    if (off <= 1e-32 * diagonal) return;
+    for (int p = 0; p < 2; ++p) {
+      for (int q = p + 1; q < 3; ++q) {
+        if (a[p][q] == 0.0) continue;
+        const double theta = (a[q][q] - a[p][p]) / (2 * a[p][q]);
+        const double t = (theta >= 0 ? 1.0 : -1.0) / (std::fabs(theta) + std::sqrt(theta * theta + 1));
+        const double c = 1 / std::sqrt(t * t + 1), s = t * c;
+        for (int k = 0; k < 3; ++k) {
+          const double kp = a[k][p], kq = a[k][q];
+          a[k][p] = c * kp - s * kq;
+          a[k][q] = s * kp + c * kq;
+        }
+        for (int k = 0; k < 3; ++k) {
+          const double pk = a[p][k], qk = a[q][k];
+          a[p][k] = c * pk - s * qk;
+          a[q][k] = s * pk + c * qk;
+        }
+        for (int k = 0; k < 3; ++k) {
+          const double kp = v[k][p], kq = v[k][q];
+          v[k][p] = c * kp - s * kq;
+          v[k][q] = s * kp + c * kq;
+        }
+      }
+    }
+  }
+}
+
+// Rows of `frame`: x (second axis), y, z (least variance), right-handed. PCA leaves the signs of x and z free: both point
+// to the side of the centre where the mean of the neighbours lies.
+void pca_frame(const std::vector<double>& offsets, double* frame) {
+  const size_t count = offsets.size() / 3;
+  double mean[3] = {}, second[6] = {};
+  for (size_t k = 0; k < count; ++k) {
+    const double x = offsets[3 * k], y = offsets[3 * k + 1], z = offsets[3 * k + 2];
+    mean[0] += x, mean[1] += y, mean[2] += z;
+    second[0] += x * x, second[1] += x * y, second[2] += x * z;
+    second[3] += y * y, second[4] += y * z, second[5] += z * z;
+  }
+  for (double& value : mean) value /= static_cast<double>(count);
+  for (double& value : second) value /= static_cast<double>(count);
+  double a[3][3] = {{second[0] - mean[0] * mean[0], second[1] - mean[0] * mean[1], second[2] - mean[0] * mean[2]},
+                    {0, second[3] - mean[1] * mean[1], second[4] - mean[1] * mean[2]},
+                    {0, 0, second[5] - mean[2] * mean[2]}};
+  a[1][0] = a[0][1], a[2][0] = a[0][2], a[2][1] = a[1][2];
+  double v[3][3];
+  jacobi(a, v);
+  int order[3] = {0, 1, 2};
+  std::stable_sort(order, order + 3, [&](int p, int q) { return a[p][p] > a[q][q]; });
+  double* x = frame;
+  double* y = frame + 3;
+  double* z = frame + 6;
+  for (int k = 0; k < 3; ++k) x[k] = v[k][order[1]], z[k] = v[k][order[2]];
+  for (double* axis : {x, z}) {
+    if (axis[0] * mean[0] + axis[1] * mean[1] + axis[2] * mean[2] < 0)
+      for (int k = 0; k < 3; ++k) axis[k] = -axis[k];
+  }
+  y[0] = z[1] * x[2] - z[2] * x[1];
+  y[1] = z[2] * x[0] - z[0] * x[2];
+  y[2] = z[0] * x[1] - z[1] * x[0];
+}
+
+// ---------------------------------------------------------------------------------------------------------------
+// What Python calls. Shapes and dtypes are patches.py's business; here every buffer's length is checked, so that a
+// mistake there is an exception and never a stray read.
+
+struct Buffer {
+  Py_buffer view{};
+  bool held = false;
+  ~Buffer() {
+    if (held) PyBuffer_Release(&view);
+  }
+  bool take(PyObject* object, Py_ssize_t item, bool writable, const char* name) {
+    const int flags = PyBUF_C_CONTIGUOUS | (writable ? PyBUF_WRITABLE : 0);
+    if (PyObject_GetBuffer(object, &view, flags) != 0) return false;
+    held = true;
+    if (view.itemsize != item && view.len != 0) {
+      PyErr_Format(PyExc_TypeError, "%s: items of %zd bytes, expected %zd", name, view.itemsize, item);
+      return false;
+    }
+    return true;
+  }
+  template <class T>
+  T* data() const {
+    return static_cast<T*>(view.buf);
+  }
+  Py_ssize_t items() const { return view.itemsize ? view.len / view.itemsize : 0; }
+};
+
+bool expect(const Buffer& buffer, Py_ssize_t items, const char* name) {
+  if (buffer.items() == items) return true;
+  PyErr_Format(PyExc_ValueError, "%s: %zd items, expected %zd", name, buffer.items(), items);
+  return false;
+}
+
+struct IndexBuffers {
+  Buffer points, ids, keys, starts, grid, shape;
+  Index index{};
+
+  // A tuple (points (3, n) f8, ids (n,) u8, cell_keys (m,) i8, cell_starts (m + 1,) i8, grid (4,) f8, shape (3,) i8).
+  bool take(PyObject* tuple) {
+    PyObject* object[6];
+    if (!PyArg_ParseTuple(tuple, "OOOOOO", &object[0], &object[1], &object[2], &object[3], &object[4], &object[5]))
+      return false;
+    if (!points.take(object[0], 8, false, "points") || !ids.take(object[1], 8, false, "ids") ||
+        !keys.take(object[2], 8, false, "cell_keys") || !starts.take(object[3], 8, false, "cell_starts") ||
+        !grid.take(object[4], 8, false, "grid") || !shape.take(object[5], 8, false, "shape"))
+      return false;
+    const Py_ssize_t n = ids.items(), m = keys.items();
+    if (!expect(points, 3 * n, "points") || !expect(starts, m + 1, "cell_starts") || !expect(grid, 4, "grid") ||
+        !expect(shape, 3, "shape"))
+      return false;
+    const double* p = points.data<double>();
+    const double* g = grid.data<double>();
+    const int64_t* s = shape.data<int64_t>();
+    index = Index{p,
+                  p + n,
+                  p + 2 * n,
+                  ids.data<uint64_t>(),
+                  n,
+                  keys.data<int64_t>(),
+                  starts.data<int64_t>(),
+                  m,
+                  {g[0], g[1], g[2]},
+                  g[3],
+                  {s[0], s[1], s[2]}};
+    if (index.cell_starts[m] != n || index.edge <= 0) {
+      PyErr_SetString(PyExc_ValueError, "the index does not fit its points");
+      return false;
+    }
+    return true;
+  }
+};
+
+bool out_of_memory() {
+  PyErr_NoMemory();
+  return false;
+}
+
+// Runs work(i) for every centre without the GIL.
+template <class Work>
+bool for_each(Py_ssize_t count, Work&& work) {
+  bool failed = false;
+  PyThreadState* state = PyEval_SaveThread();
+  try {
+    for (Py_ssize_t i = 0; i < count; ++i) work(i);
+  } catch (const std::bad_alloc&) {
+    failed = true;
+  }
+  PyEval_RestoreThread(state);
+  return failed ? out_of_memory() : true;
+}
+
+PyObject* count_neighbours(PyObject*, PyObject* args) {
+  PyObject *index_object, *centres_object, *counts_object;
+  double radius;
+  if (!PyArg_ParseTuple(args, "OOdO", &index_object, &centres_object, &radius, &counts_object)) return nullptr;
+  IndexBuffers held;
+  Buffer centres, counts;
+  if (!held.take(index_object) || !centres.take(centres_object, 8, false, "centres") ||
+      !counts.take(counts_object, 8, true, "counts") || !expect(centres, 3 * counts.items(), "centres"))
+    return nullptr;
+  Neighbourhood neighbourhood(held.index, radius);
+  const bool done = for_each(counts.items(), [&](Py_ssize_t i) {
+    counts.data<int64_t>()[i] =
+        static_cast<int64_t>(neighbourhood.around(centres.data<double>() + 3 * i).size());
+  });
+  if (!done) return nullptr;
+  Py_RETURN_NONE;
+}
+
+PyObject* sample_neighbours(PyObject*, PyObject* args) {
+  PyObject *index_object, *centres_object, *centre_ids_object, *indices_object, *counts_object;
+  double radius;
+  unsigned long long key;
+  if (!PyArg_ParseTuple(args, "OOOdKOO", &index_object, &centres_object, &centre_ids_object, &radius, &key,
+                        &indices_object, &counts_object))
+    return nullptr;
+  IndexBuffers held;
+  Buffer centres, centre_ids, indices, counts;
+  if (!held.take(index_object) || !centres.take(centres_object, 8, false, "centres") ||
+      !centre_ids.take(centre_ids_object, 8, false, "centre_ids") ||
+      !indices.take(indices_object, 8, true, "indices") || !counts.take(counts_object, 8, true, "counts"))
+    return nullptr;
+  const Py_ssize_t n = counts.items();
+  const Py_ssize_t length = n ? indices.items() / n : 0;
+  if (!expect(centres, 3 * n, "centres") || !expect(centre_ids, n, "centre_ids") ||
+      !expect(indices, n * length, "indices"))
+    return nullptr;
+  Neighbourhood neighbourhood(held.index, radius);
+  Selection selection;
+  std::vector<int64_t> members;
+  const bool done = for_each(length ? n : 0, [&](Py_ssize_t i) {
+    members = neighbourhood.around(centres.data<double>() + 3 * i);
+    counts.data<int64_t>()[i] = static_cast<int64_t>(members.size());
+    if (static_cast<Py_ssize_t>(members.size()) > length)
+      selection.keep(members, held.index.ids, centre_ids.data<uint64_t>()[i], key, static_cast<size_t>(length));
+    int64_t* row = indices.data<int64_t>() + i * length;
+    std::copy(members.begin(), members.end(), row);
+    std::fill(row + members.size(), row + length, int64_t{-1});
+  });
+  if (!done) return nullptr;
+  Py_RETURN_NONE;
+}
+
+PyObject* build_patches(PyObject*, PyObject* args) {
+  PyObject *index_object, *centres_object, *centre_ids_object, *patches_object, *frames_object, *counts_object;
+  double radius;
+  unsigned long long key;
+  if (!PyArg_ParseTuple(args, "OOOdKOOO", &index_object, &centres_object, &centre_ids_object, &radius, &key,
+                        &patches_object, &frames_object, &counts_object))
+    return nullptr;
+  IndexBuffers held;
+  Buffer centres, centre_ids, patches, frames, counts;
+  if (!held.take(index_object) || !centres.take(centres_object, 8, false, "centres") ||
+      !centre_ids.take(centre_ids_object, 8, false, "centre_ids") ||
+      !patches.take(patches_object, 4, true, "patches") || !frames.take(frames_object, 8, true, "frames") ||
+      !counts.take(counts_object, 8, true, "counts"))
+    return nullptr;
+  const Py_ssize_t n = counts.items();
+  const Py_ssize_t length = n ? patches.items() / (3 * n) : 0;
+  if (!expect(centres, 3 * n, "centres") || !expect(centre_ids, n, "centre_ids") || !expect(frames, 9 * n, "frames") ||
+      !expect(patches, 3 * n * length, "patches"))
+    return nullptr;
+  const Index& index = held.index;
+  Neighbourhood neighbourhood(index, radius);
+  Selection selection;
+  std::vector<int64_t> members;
+  std::vector<double> offsets;
+  const bool done = for_each(length ? n : 0, [&](Py_ssize_t i) {
+    const double* centre = centres.data<double>() + 3 * i;
+    double* frame = frames.data<double>() + 9 * i;
+    float* patch = patches.data<float>() + 3 * length * i;
+    members = neighbourhood.around(centre);
+    counts.data<int64_t>()[i] = static_cast<int64_t>(members.size());
+    if (members.empty()) {
+      for (int k = 0; k < 9; ++k) frame[k] = k % 4 == 0;
+      std::fill(patch, patch + 3 * length, 0.0f);
+      return;
+    }
+    offsets.resize(3 * members.size());
+    for (size_t k = 0; k < members.size(); ++k) {
+      offsets[3 * k] = (index.x[members[k]] - centre[0]) / radius;
+      offsets[3 * k + 1] = (index.y[members[k]] - centre[1]) / radius;
+      offsets[3 * k + 2] = (index.z[members[k]] - centre[2]) / radius;
+    }
+    pca_frame(offsets, frame);
+    if (static_cast<Py_ssize_t>(members.size()) > length)
+      selection.keep(members, index.ids, centre_ids.data<uint64_t>()[i], key, static_cast<size_t>(length));
+    for (size_t k = 0; k < members.size(); ++k) {
+      const double x = (index.x[members[k]] - centre[0]) / radius;
+      const double y = (index.y[members[k]] - centre[1]) / radius;
+      const double z = (index.z[members[k]] - centre[2]) / radius;
+      for (int row = 0; row < 3; ++row)
+        patch[3 * k + static_cast<size_t>(row)] =
+            static_cast<float>(frame[3 * row] * x + frame[3 * row + 1] * y + frame[3 * row + 2] * z);
+    }
+    std::fill(patch + 3 * members.size(), patch + 3 * length, 0.0f);
+  });
+  if (!done) return nullptr;
+  Py_RETURN_NONE;
+}
+
+PyMethodDef methods[] = {
+    {"count_neighbours", count_neighbours, METH_VARARGS,
+     "count_neighbours(index, centres (q, 3) f8, radius, counts (q,) i8 out)"},
+    {"sample_neighbours", sample_neighbours, METH_VARARGS,
+     "sample_neighbours(index, centres (q, 3) f8, centre_ids (q,) u8, radius, key, indices (q, N) i8 out, "
+     "counts (q,) i8 out)"},
+    {"build_patches", build_patches, METH_VARARGS,
+     "build_patches(index, centres (q, 3) f8, centre_ids (q,) u8, radius, key, patches (q, N, 3) f4 out, "
+     "frames (q, 3, 3) f8 out, counts (q,) i8 out)"},
+    {nullptr, nullptr, 0, nullptr}};
+
+PyModuleDef module = {PyModuleDef_HEAD_INIT, "_native", "Compiled part of pointfilter.patches.", 0, methods,
+                      nullptr,               nullptr,   nullptr,                                 nullptr};
+
+}  // namespace
+
+PyMODINIT_FUNC PyInit__native() { return PyModule_Create(&module); }

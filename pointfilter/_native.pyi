@@ -1,0 +1,28 @@
+from typing import Any
+
+from numpy.typing import NDArray
+
+Index = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
+
+def count_neighbours(index: Index, centres: NDArray[Any], radius: float, counts: NDArray[Any], /) -> None: ...
+def sample_neighbours(
+    index: Index,
+    centres: NDArray[Any],
+    centre_ids: NDArray[Any],
+    radius: float,
+    key: int,
+    indices: NDArray[Any],
+    counts: NDArray[Any],
+    /,
+) -> None: ...
+def build_patches(
+    index: Index,
+    centres: NDArray[Any],
+    centre_ids: NDArray[Any],
+    radius: float,
+    key: int,
+    patches: NDArray[Any],
+    frames: NDArray[Any],
+    counts: NDArray[Any],
+    /,
+) -> None: ...

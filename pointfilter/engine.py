@@ -1,0 +1,103 @@
+"""What evaluates a batch of patches: an onnxruntime session with an explicit provider and explicit threads."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from pointfilter.errors import InvalidModelError, ParameterError, ProviderUnavailableError
+from pointfilter.models import ModelBundle
+
+DEVICES = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+AUTO_ORDER = ("cuda", "cpu")
+MAX_THREADS = 1024
+
+# From 1.31 on onnxruntime reports usage to its makers unless told not to. A scan is nobody's business.
+onnxruntime.disable_telemetry_events()
+
+
+class Engine:
+    """Patches (B, N, 3) float32 to displacements (B, 3) float32. Safe to call from several threads at once.
+
+    On a CPU every call runs in its caller's thread; `threads` says how many callers to have (filter_points does it).
+    That way no batch waits for another one's slowest layer, and the result cannot depend on the number of threads.
+    """
+
+    def __init__(self, bundle: ModelBundle, device: str = "auto", threads: int = 0) -> None:
+        """device: auto, or a name in DEVICES; one that was asked for by name and is missing is an error, never a
+        silent fallback. threads: 0 takes what the machine, the affinity and the container allow.
+
+        Raises ProviderUnavailableError, ParameterError, InvalidModelError.
+        """
+        self.bundle = bundle
+        self.device, provider = _choose(device)
+        if not 0 <= threads <= MAX_THREADS:
+            raise ParameterError(
+                f"threads must be from 0 to {MAX_THREADS}, got {threads}", limit=MAX_THREADS, actual=threads
+            )
+        self.threads = threads or available_cpus()
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        options.inter_op_num_threads = 1
+        # The arena keeps the largest batch for ever; batches are alike, so it gains nothing here.
+        options.enable_cpu_mem_arena = False
+        options.log_severity_level = 3
+        try:
+            self._session = onnxruntime.InferenceSession(bundle.onnx, options, providers=[provider])
+        except Exception as error:  # onnxruntime's own tree differs between versions and providers
+            raise InvalidModelError(f"onnxruntime cannot load model {bundle.name!r}: {_first_line(error)}") from error
+        self.provider: str = self._session.get_providers()[0]
+        if self.provider != provider:
+            raise ProviderUnavailableError(
+                f"{provider} was asked for and {self.provider} came up",
+                hint="see the log of onnxruntime for the reason",
+            )
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        if len(inputs) != 1 or len(outputs) != 1:
+            raise InvalidModelError(f"model {bundle.name!r} must have one input and one output")
+        self._input, self._output = inputs[0].name, outputs[0].name
+
+    def __call__(self, patches: NDArray[np.float32]) -> NDArray[np.float32]:
+        answer: NDArray[np.float32] = self._session.run([self._output], {self._input: patches})[0]
+        return answer
+
+    def warm_up(self) -> None:
+        """One real inference; raises InvalidModelError when the answer is not what the bundle promises."""
+        generator = np.random.default_rng(0)
+        patches = generator.uniform(-1, 1, (2, self.bundle.patch_points, 3)).astype(np.float32)
+        answer = self(patches)
+        if answer.shape != (2, 3) or not np.isfinite(answer).all():
+            raise InvalidModelError(f"model {self.bundle.name!r} answered a test patch with shape {answer.shape}")
+
+
+def _choose(device: str) -> tuple[str, str]:
+    present = onnxruntime.get_available_providers()
+    if device == "auto":
+        device = next(name for name in AUTO_ORDER if DEVICES[name] in present)
+    if device not in DEVICES:
+        raise ParameterError(f"device must be one of auto, {', '.join(DEVICES)}, got {device!r}", actual=device)
+    if DEVICES[device] not in present:
+        raise ProviderUnavailableError(
+            f"device {device!r} needs {DEVICES[device]}, which this onnxruntime does not have",
+            actual=", ".join(present),
+            hint="install the onnxruntime build for it, or use device=auto",
+        )
+    return device, DEVICES[device]
+
+
+def available_cpus() -> int:
+    """CPUs that this process may use: affinity, and the cgroup's quota in a container."""
+    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+    except (OSError, ValueError):
+        return cpus
+    return cpus if quota == "max" else max(1, min(cpus, round(int(quota) / int(period))))
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0][:200] if str(error) else type(error).__name__

@@ -1,0 +1,195 @@
+"""Eq. 8 and its iterations: the one place where displacements become points.
+
+p̄ᵢ = r · R⁻¹ · f(R(P̂ᵢ − p̂ᵢ)/r) + p̂ᵢ
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pointfilter.errors import DegenerateCloudError, FilteringCancelledError, ParameterError, TooFewPointsError
+from pointfilter.noise import bounding_box_diagonal
+from pointfilter.patches import NeighbourIndex, length_buckets, sampling_key, stable_ids
+
+Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Predict = Callable[[Float32], Float32]
+"""A network: patches (B, N, 3) float32 -> displacements (B, 3) float32, both in patch frames and in units of r."""
+
+DEFAULT_RADIUS = 0.05  # of the bounding-box diagonal (§3.2)
+DEFAULT_ITERATIONS = 2
+MAX_ITERATIONS = 100
+MIN_NEIGHBOURS = 4  # fewer, the centre included, say nothing about a surface: the point stays where it is
+ROWS_PER_BATCH = (
+    32_768  # points a batch, all patches together: large enough for the products, small enough for the cache
+)
+
+
+@dataclass
+class Timings:
+    """Seconds spent, by stage. `patches` and `infer` are summed over the workers."""
+
+    index: float = 0.0
+    patches: float = 0.0
+    infer: float = 0.0
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    def as_dict(self) -> dict[str, float]:
+        return {"index": self.index, "patches": self.patches, "infer": self.infer}
+
+    @contextmanager
+    def measure(self, stage: str) -> Iterator[None]:
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            with self._lock:
+                setattr(self, stage, getattr(self, stage) + time.perf_counter() - started)
+
+
+def resolve_radius(points: Float64, radius: float | None, fraction: float = DEFAULT_RADIUS) -> float:
+    """The absolute radius: the given one, or `fraction` of the bounding-box diagonal of the (n, 3) points.
+
+    Raises ParameterError for a radius that is not a finite number above 0, DegenerateCloudError when the points have no
+    extent to take a fraction of.
+    """
+    if radius is not None:
+        if not (np.isfinite(radius) and radius > 0):
+            raise ParameterError("radius must be a finite number above 0", limit=0, actual=radius)
+        return float(radius)
+    diagonal = bounding_box_diagonal(points)
+    if not diagonal > 0:
+        raise DegenerateCloudError(
+            "all points are at the same place, so there is no extent to take a radius from",
+            hint="pass radius in the units of the file",
+        )
+    if not np.isfinite(diagonal):
+        raise DegenerateCloudError("the extent of the cloud is beyond double precision", hint="remove the stray points")
+    return diagonal * fraction
+
+
+def filter_points(
+    points: Float64,
+    predict: Predict,
+    *,
+    radius: float | None = None,
+    iterations: int = DEFAULT_ITERATIONS,
+    patch_points: int = 500,
+    seed: int = 0,
+    threads: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+    timings: Timings | None = None,
+) -> Float64:
+    """Filters (n, 3) finite float64 points; returns the moved points, same shape, same order.
+
+    radius: absolute, in the unit of the points; by default 5 % of the bounding-box diagonal. It is taken once, from the
+    input, and kept for all iterations. patch_points: N, what the network was trained with. seed: of the downsampling.
+    threads: how many batches are evaluated at once; the result does not depend on it. progress(done, total) is called
+    from this thread, in units of points times iterations. cancelled() is asked between batches.
+
+    Raises TooFewPointsError, DegenerateCloudError, ParameterError, FilteringCancelledError.
+    """
+    if len(points) < MIN_NEIGHBOURS:
+        raise TooFewPointsError(
+            f"a cloud needs at least {MIN_NEIGHBOURS} finite points, this one has {len(points)}",
+            limit=MIN_NEIGHBOURS,
+            actual=len(points),
+        )
+    if not 1 <= iterations <= MAX_ITERATIONS:
+        raise ParameterError(
+            f"iterations must be from 1 to {MAX_ITERATIONS}, got {iterations}", limit=MAX_ITERATIONS, actual=iterations
+        )
+    if not 0 <= seed < 2**63:
+        raise ParameterError(f"seed must be from 0 to 2^63 - 1, got {seed}", actual=seed)
+    absolute_radius = resolve_radius(points, radius)
+    timings = timings or Timings()
+    offset = (points.min(axis=0) + points.max(axis=0)) / 2  # large coordinates must not cost digits
+    moved = points - offset
+    ids = stable_ids(moved)
+    for iteration in range(iterations):
+        with timings.measure("index"):
+            index = NeighbourIndex(moved, absolute_radius, ids)
+
+        def report(done: int, iteration: int = iteration) -> None:
+            if progress is not None:
+                progress(iteration * len(points) + done, iterations * len(points))
+
+        moved = _one_pass(
+            moved, ids, index, predict, patch_points, sampling_key(seed, iteration), threads, report, cancelled, timings
+        )
+    return np.asarray(moved + offset)
+
+
+def _one_pass(
+    points: Float64,
+    ids: NDArray[np.uint64],
+    index: NeighbourIndex,
+    predict: Predict,
+    patch_points: int,
+    key: int,
+    threads: int,
+    report: Callable[[int], None],
+    cancelled: Callable[[], bool] | None,
+    timings: Timings,
+) -> Float64:
+    """Eq. 8 once for every point. Batches depend on the cloud alone, each point's answer on its own patch alone."""
+    rows = index.order  # in this order neighbours in space are neighbours in memory
+    centres, centre_ids = points[rows], ids[rows]
+    result = points.copy()
+
+    def evaluate(chosen: NDArray[np.int64], length: int) -> int:
+        with timings.measure("patches"):
+            patches = index.patches(centres[chosen], centre_ids[chosen], length, key)
+        with timings.measure("infer"):
+            displacements = predict(patches.points).astype(np.float64)
+        # r R⁻¹ f(.): R is a rotation, so its inverse is its transpose; rows of `frames` are the axes.
+        steps = np.einsum("bi,bij->bj", displacements, patches.frames) * index.radius
+        steps[patches.counts < MIN_NEIGHBOURS] = 0.0
+        result[rows[chosen]] = centres[chosen] + steps
+        return len(chosen)
+
+    with timings.measure("patches"):
+        counts = _count(index, centres, threads)
+
+    def tasks() -> Iterator[tuple[NDArray[np.int64], int]]:
+        for length, positions in length_buckets(counts, patch_points):
+            size = max(1, ROWS_PER_BATCH // length)
+            for start in range(0, len(positions), size):
+                yield positions[start : start + size], length
+
+    done = 0
+    with ThreadPoolExecutor(threads, thread_name_prefix="patches") as pool:
+        waiting: set[Future[int]] = set()
+        queue = tasks()
+        exhausted = False
+        try:
+            while waiting or not exhausted:
+                while not exhausted and len(waiting) < 2 * threads:
+                    if (task := next(queue, None)) is None:
+                        exhausted = True
+                    else:
+                        waiting.add(pool.submit(evaluate, *task))
+                finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                done += sum(future.result() for future in finished)
+                report(done)
+                if cancelled is not None and cancelled():
+                    raise FilteringCancelledError("filtering was cancelled")
+        finally:
+            for future in waiting:
+                future.cancel()
+    return result
+
+
+def _count(index: NeighbourIndex, centres: Float64, threads: int) -> NDArray[np.int64]:
+    parts = np.array_split(centres, max(1, min(4 * threads, len(centres) // 1024)))
+    with ThreadPoolExecutor(threads, thread_name_prefix="count") as pool:
+        return np.concatenate(list(pool.map(index.count, parts)))

@@ -1,0 +1,378 @@
+"""PLY in and out, byte for byte but for x, y and z.
+
+The file is not taken apart and put together again: the coordinates are read from its bytes and, on the way out, written
+into a copy of them. So other columns, lists, faces, comments, spelling and line endings cannot get lost, and what comes
+after the vertices is checked but never held as objects. plyfile writes clouds that come from arrays and converts
+encodings; docs/adr/0003-ply-by-splicing.md says why it does not do the rest.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+import tempfile
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import plyfile
+from numpy.typing import NDArray
+
+from pointfilter.cloud import PointCloud
+from pointfilter.errors import MalformedFileError, ParameterError
+from pointfilter.formats.ply_header import ENCODINGS, TYPES, ByteOrder, Element, Header, Property, read_header
+from pointfilter.limits import ReadLimits
+
+Float64 = NDArray[np.float64]
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class PlySource:
+    """The file's bytes and where the vertices are in them."""
+
+    header: Header
+    data: mmap.mmap | bytes = field(repr=False)
+    vertex_start: int
+    vertex_stop: int
+    offsets: NDArray[np.int64] | None = field(default=None, repr=False)
+    """(n, 3) byte positions of x, y and z, for binary vertices that hold lists."""
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        return {
+            "format": "ply",
+            "encoding": self.header.encoding,
+            "elements": {
+                element.name: {
+                    "count": element.count,
+                    "properties": [_spelled(property) for property in element.properties],
+                }
+                for element in self.header.elements
+            },
+            "comments": list(self.header.comments),
+            "obj_info": list(self.header.obj_info),
+        }
+
+
+def read(path: Path, limits: ReadLimits) -> PointCloud:
+    """Reads a PLY file from disk. Raises MalformedFileError (line or byte named), UnsupportedFormatError,
+    MissingCoordinatesError, LimitExceededError, OSError."""
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        header = read_header(file, size, limits)
+        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    return _read_ascii(header, data) if header.encoding == "ascii" else _read_binary(header, data)
+
+
+def write(cloud: PointCloud, path: Path, encoding: str = "same", comment: str | None = None) -> None:
+    """Writes a cloud to disk, atomically: the file is there whole or not at all.
+
+    encoding: "same" as the source (a cloud without one becomes binary_little_endian), or one of ENCODINGS. comment: a
+    line to add to the header.
+    """
+    if encoding != "same" and encoding not in ENCODINGS:
+        raise ParameterError(f"format must be one of same, {', '.join(ENCODINGS)}, got {encoding!r}", actual=encoding)
+    if comment is not None and not (comment.isascii() and comment.isprintable()):
+        raise ValueError("a comment must be one line of printable ASCII")
+    handle, partial = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            if isinstance(cloud.source, PlySource):
+                _write_spliced(cloud, cloud.source, file, comment)
+            else:
+                _write_new(cloud, file, comment)
+        source_encoding = (
+            cloud.source.header.encoding if isinstance(cloud.source, PlySource) else "binary_little_endian"
+        )
+        if encoding not in ("same", source_encoding):
+            _convert(Path(partial), encoding)
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(partial, 0o666 & ~mask)  # mkstemp makes it private; the result is the user's ordinary file
+        os.replace(partial, path)
+    except BaseException:
+        Path(partial).unlink(missing_ok=True)
+        raise
+
+
+# --- binary ---------------------------------------------------------------------------------------------------------
+
+
+def _read_binary(header: Header, data: mmap.mmap) -> PointCloud:
+    position = header.size
+    start = stop = position
+    offsets = None
+    for element in header.elements:
+        begin = position
+        wanted = element.name == "vertex"
+        if element.has_lists:
+            position, found = _walk(element, header.order, data, position, wanted)
+            offsets = found if wanted else offsets
+        else:
+            position += element.count * element.smallest_row(ascii=False)
+        if position > len(data):
+            raise MalformedFileError(
+                f"the file ends at byte {len(data)}, inside element {element.name!r}, which needs byte {position}",
+                hint="the file is truncated",
+            )
+        if wanted:
+            start, stop = begin, position
+    source = PlySource(header, data, start, stop, offsets)
+    xyz = np.empty((header.vertex.count, 3), dtype=np.float64)
+    for axis, property in enumerate(_axes(header.vertex)):
+        with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN
+            xyz[:, axis] = _column(source, np.frombuffer(data, np.uint8), axis, property)
+    return PointCloud(xyz, source)
+
+
+def _axes(vertex: Element) -> list[Property]:
+    found = {property.name: property for property in vertex.properties}
+    return [found[name] for name in AXES]
+
+
+def _column(source: PlySource, raw: NDArray[np.uint8], axis: int, property: Property) -> NDArray[Any]:
+    """The values of one coordinate: a view on the bytes, or a gathered copy where rows have lists."""
+    dtype = property.dtype(source.header.order)
+    if source.offsets is not None:
+        rows = source.offsets[:, axis, None] + np.arange(dtype.itemsize)
+        return raw[rows].view(dtype)[:, 0] if len(rows) else np.empty(0, dtype)
+    vertex = source.header.vertex
+    before = sum(p.dtype("=").itemsize for p in vertex.properties[: vertex.properties.index(property)])
+    return np.ndarray(
+        (vertex.count,), dtype, raw.data, source.vertex_start + before, (vertex.smallest_row(ascii=False),)
+    )
+
+
+def _walk(
+    element: Element, order: ByteOrder, data: mmap.mmap, position: int, wanted: bool
+) -> tuple[int, NDArray[np.int64] | None]:
+    """Steps over rows with lists, checking every length against the file: (end, offsets of x, y, z where wanted)."""
+    size = len(data)
+    steps = _steps(element, order)
+    coordinates = array("q")
+    for row in range(element.count):
+        for name, length, item in steps:
+            if wanted and name in AXES:
+                coordinates.append(position)
+            if length is None:
+                position += item
+                continue
+            count = length.unpack_from(data, position)[0] if position + length.size <= size else 0
+            if count < 0 or position + length.size + count * item > size:
+                raise MalformedFileError(
+                    f"byte {position}: row {row} of element {element.name!r} has a list {name!r} of {count} items, "
+                    f"which the file of {size} bytes does not hold"
+                )
+            position += length.size + count * item
+        if position > size or (row + 1 < element.count and position == size):
+            raise MalformedFileError(
+                f"the file ends at byte {size}, in row {row} of element {element.name!r}", hint="the file is truncated"
+            )
+    if not wanted:
+        return position, None
+    in_order = [property.name for property in element.properties if property.name in AXES]
+    offsets = np.frombuffer(coordinates, np.int64).reshape(-1, 3)
+    return position, offsets[:, [in_order.index(name) for name in AXES]]
+
+
+def _steps(element: Element, order: ByteOrder) -> list[tuple[str, struct.Struct | None, int]]:
+    codes = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I"}
+    prefix = "<" if order == "<" else ">"
+    return [
+        (
+            property.name,
+            struct.Struct(prefix + codes[TYPES[property.length_type]]) if property.length_type else None,
+            property.dtype(order).itemsize,
+        )
+        for property in element.properties
+    ]
+
+
+# --- ascii ----------------------------------------------------------------------------------------------------------
+
+
+def _read_ascii(header: Header, data: mmap.mmap) -> PointCloud:
+    number = header.raw.count(b"\n") + 1  # lines of the header
+    position = header.size
+    start = stop = position
+    coordinates = array("d")
+    for element in header.elements:
+        begin = position
+        wanted = element.name == "vertex"
+        fields = _fields(element)
+        for _ in range(element.count):
+            end = data.find(b"\n", position)
+            end = len(data) if end < 0 else end
+            tokens = data[position:end].split()
+            number += 1
+            if position >= len(data):
+                raise MalformedFileError(f"line {number}: the file ends inside element {element.name!r}")
+            columns = _columns(tokens, element, fields, number)
+            if wanted:
+                try:
+                    coordinates.extend([float(tokens[columns[axis]]) for axis in range(3)])
+                except ValueError:
+                    raise MalformedFileError(f"line {number}: x, y and z must be numbers") from None
+            position = end + 1
+        if wanted:
+            start, stop = begin, min(position, len(data))
+    xyz = np.frombuffer(coordinates, np.float64).reshape(-1, 3).copy()
+    for axis, property in enumerate(_axes(header.vertex)):  # a float property holds floats, however many digits it has
+        with np.errstate(over="ignore"):
+            xyz[:, axis] = xyz[:, axis].astype(TYPES[property.type])
+    return PointCloud(xyz, PlySource(header, data, start, stop))
+
+
+def _fields(element: Element) -> list[int] | None:
+    """Columns of x, y and z where no list comes into it; None where rows must be walked."""
+    if element.has_lists:
+        return None
+    names = [property.name for property in element.properties]
+    return [names.index(name) if name in names else 0 for name in AXES]
+
+
+def _columns(tokens: list[bytes], element: Element, fields: list[int] | None, number: int) -> list[int]:
+    """Columns of x, y and z in this row; checks that the row has as many values as its element says."""
+    if fields is not None:
+        if len(tokens) != len(element.properties):
+            raise MalformedFileError(
+                f"line {number}: {len(tokens)} values for the {len(element.properties)} properties of {element.name!r}"
+            )
+        return fields
+    places = {}
+    column = 0
+    for property in element.properties:
+        places[property.name] = column
+        if property.length_type:
+            length = tokens[column] if column < len(tokens) else b""
+            if not length.isdigit() or len(length) > 10:
+                raise MalformedFileError(f"line {number}: list {property.name!r} has no length")
+            column += int(length)
+        column += 1
+    if column != len(tokens):
+        raise MalformedFileError(f"line {number}: {len(tokens)} values, the row's lists and properties need {column}")
+    return [places.get(name, 0) for name in AXES]
+
+
+# --- writing --------------------------------------------------------------------------------------------------------
+
+
+def _write_spliced(cloud: PointCloud, source: PlySource, file: BinaryIO, comment: str | None) -> None:
+    header = source.header
+    file.write(header.raw)
+    if comment is not None:
+        file.write(b"comment " + comment.encode() + header.ending)
+    file.write(b"end_header" + header.ending)
+    file.write(source.data[header.size : source.vertex_start])
+    vertices = _spliced_ascii(cloud, source) if header.encoding == "ascii" else _spliced_binary(cloud, source)
+    for part in vertices:
+        file.write(part)
+    _copy(source.data, source.vertex_stop, file)
+
+
+def _copy(data: mmap.mmap | bytes, start: int, file: BinaryIO, step: int = 1 << 24) -> None:
+    for position in range(start, len(data), step):
+        file.write(data[position : position + step])
+
+
+def _spliced_binary(cloud: PointCloud, source: PlySource) -> Iterator[bytes | memoryview]:
+    """The vertex bytes with new coordinates; coordinates that did not change keep their bytes, NaN payloads too."""
+    raw = np.frombuffer(source.data, np.uint8)
+    rows = np.array(raw[source.vertex_start : source.vertex_stop])
+    shift = source.vertex_start
+    local = PlySource(source.header, b"", 0, 0, None if source.offsets is None else source.offsets - shift)
+    for axis, property in enumerate(_axes(source.header.vertex)):
+        dtype = property.dtype(source.header.order)
+        old = _column(source, raw, axis, property)
+        values = _cast(cloud.xyz[:, axis], dtype)
+        changed = (values != old) & np.isfinite(values)
+        if local.offsets is None:
+            column = _column(local, rows, axis, property)
+            column[changed] = values[changed]
+        else:
+            places = local.offsets[changed, axis, None] + np.arange(dtype.itemsize)
+            rows[places] = values[changed].astype(dtype).view(np.uint8).reshape(-1, dtype.itemsize)
+    yield rows.data
+
+
+def _cast(values: Float64, dtype: np.dtype) -> NDArray[Any]:
+    with np.errstate(over="ignore"):
+        return values.astype(dtype)
+
+
+def _spliced_ascii(cloud: PointCloud, source: PlySource, step: int = 4096) -> Iterator[bytes]:
+    vertex = source.header.vertex
+    fields = _fields(vertex)
+    types = [np.dtype(TYPES[property.type]) for property in _axes(vertex)]
+    position = source.vertex_start
+    texts: list[list[str]] = []
+    lines: list[bytes] = []
+    for row in range(vertex.count):
+        if row % step == 0:
+            part = cloud.xyz[row : row + step]
+            # The shortest text that reads back as the same number, in the property's own type.
+            texts = [_cast(part[:, axis], types[axis]).astype(str).tolist() for axis in range(3)]
+        end = source.data.find(b"\n", position, source.vertex_stop)
+        end = source.vertex_stop if end < 0 else end + 1
+        line = source.data[position:end]
+        position = end
+        pieces = _split_keeping_spaces(line)
+        columns = _columns(pieces[1::2], vertex, fields, row)
+        for axis in range(3):
+            place = 2 * columns[axis] + 1
+            text = texts[axis][row % step]
+            if types[axis].type(pieces[place]) != types[axis].type(text) and np.isfinite(float(text)):
+                pieces[place] = text.encode()
+        lines.append(b"".join(pieces))
+        if len(lines) == step:
+            yield b"".join(lines)
+            lines.clear()
+    yield b"".join(lines)
+
+
+def _split_keeping_spaces(line: bytes) -> list[bytes]:
+    """[space, token, space, token, ..., space]; the first and the last may be empty."""
+    pieces = []
+    position = 0
+    for token in line.split():
+        start = line.index(token, position)
+        pieces += [line[position:start], token]
+        position = start + len(token)
+    return [*pieces, line[position:]]
+
+
+def _write_new(cloud: PointCloud, file: BinaryIO, comment: str | None) -> None:
+    vertices = np.empty(len(cloud), dtype=[(name, "<f8") for name in AXES])
+    for axis, name in enumerate(AXES):
+        vertices[name] = cloud.xyz[:, axis]
+    element = plyfile.PlyElement.describe(vertices, "vertex")
+    plyfile.PlyData([element], byte_order="<", comments=[comment] if comment else []).write(file)
+
+
+def _convert(path: Path, encoding: str) -> None:
+    """Rewrites our own, already checked file in another encoding; plyfile reads and writes it."""
+    try:
+        data = plyfile.PlyData.read(str(path), mmap=False)
+        if encoding == "binary_big_endian" and any(_mixes_lists(element) for element in data):
+            # plyfile 1.1 writes the numbers of such rows in the machine's own byte order.
+            raise ParameterError("rows that hold both lists and numbers cannot be converted to binary_big_endian")
+        data.text = encoding == "ascii"
+        data.byte_order = ENCODINGS[encoding]
+        data.write(str(path))
+    except (plyfile.PlyParseError, ValueError, UnicodeError) as error:
+        raise MalformedFileError(f"the file cannot be converted to {encoding}: {error}") from error
+
+
+def _mixes_lists(element: plyfile.PlyElement) -> bool:
+    lists = [isinstance(property, plyfile.PlyListProperty) for property in element.properties]
+    return any(lists) and not all(lists)
+
+
+def _spelled(property: Property) -> str:
+    kind = f"list {property.length_type} {property.type}" if property.length_type else property.type
+    return f"{kind} {property.name}"

@@ -1,0 +1,102 @@
+"""Model bundles: a folder with model.onnx and model.json.
+
+model.json says what the weights are and how to use them: version, sha256 of model.onnx, architecture, opset, points a
+patch, radius, default iterations, training record, scores. Bundles shipped with the package are in bundles/.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pointfilter.errors import InvalidModelError, ModelNotFoundError
+
+SCHEMA = 1
+FRAME = "pca-mean-sign"  # the frame's sign rule that the weights were trained with (patches.py)
+BUNDLES = Path(__file__).parent / "bundles"
+DEFAULT_MODEL = "pointfilter-fast"
+
+_FIELDS: dict[str, type | tuple[type, ...]] = {
+    "schema": int, "name": str, "version": str, "sha256": str, "opset": int, "frame": str, "patch_points": int,
+    "radius": float, "iterations": int, "parameters": int, "network": dict, "training": dict, "scores": dict,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ModelBundle:
+    """One model: its folder and what its model.json says."""
+
+    folder: Path
+    name: str
+    version: str
+    sha256: str
+    opset: int
+    patch_points: int
+    """Most points of a patch (N in §3.2)."""
+    radius: float
+    """Default patch radius, as a fraction of the bounding-box diagonal."""
+    iterations: int
+    """Default number of iterations."""
+    parameters: int
+    network: dict[str, Any]
+    training: dict[str, Any] = field(repr=False)
+    scores: dict[str, Any] = field(repr=False)
+
+    @property
+    def onnx(self) -> Path:
+        return self.folder / "model.onnx"
+
+    def summary(self) -> dict[str, Any]:
+        """What `pointfilter models` and GET /models show."""
+        names = ("name", "version", "sha256", "opset", "patch_points", "radius", "iterations", "parameters", "network")
+        return {name: getattr(self, name) for name in (*names, "training", "scores")}
+
+
+def load_bundle(folder: Path) -> ModelBundle:
+    """Reads a bundle and checks its weights against their sha256.
+
+    Raises ModelNotFoundError when there is no bundle, InvalidModelError when it is damaged or of another version.
+    """
+    try:
+        described = json.loads((folder / "model.json").read_text(encoding="utf-8"))
+        digest = hashlib.sha256((folder / "model.onnx").read_bytes()).hexdigest()
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise ModelNotFoundError(f"no model bundle in {folder.name!r}: it needs model.onnx and model.json") from error
+    except ValueError as error:
+        raise InvalidModelError(f"model.json of {folder.name!r} is not JSON: {error}") from error
+    if not isinstance(described, dict) or described.get("schema") != SCHEMA:
+        found = described.get("schema") if isinstance(described, dict) else None
+        raise InvalidModelError(f"model.json of {folder.name!r} has schema {found!r}, this version reads {SCHEMA}")
+    for name, kind in _FIELDS.items():
+        if not isinstance(described.get(name), kind):
+            raise InvalidModelError(f"model.json of {folder.name!r}: {name!r} is missing or of the wrong type")
+    if described["frame"] != FRAME:
+        raise InvalidModelError(f"model {folder.name!r} was trained with frames {described['frame']!r}, not {FRAME!r}")
+    if described["sha256"] != digest:
+        raise InvalidModelError(f"model.onnx of {folder.name!r} has sha256 {digest[:12]}…, its model.json says another")
+    known = ModelBundle.__dataclass_fields__.keys() - {"folder"}
+    return ModelBundle(folder=folder, **{name: described[name] for name in known})
+
+
+def available_models(folders: Sequence[Path] = ()) -> dict[str, Path]:
+    """Bundle folders by name: those in `folders` (each a folder of bundles), then those in the package."""
+    found: dict[str, Path] = {}
+    for parent in (*folders, BUNDLES):
+        if parent.is_dir():
+            for path in sorted(parent.iterdir()):
+                if (path / "model.json").is_file():
+                    found.setdefault(path.name, path)
+    return found
+
+
+def find_model(name: str | None = None, folders: Sequence[Path] = ()) -> ModelBundle:
+    """The bundle of this name (default: DEFAULT_MODEL). Raises ModelNotFoundError, InvalidModelError."""
+    name = name or DEFAULT_MODEL
+    models = available_models(folders)
+    if name not in models:
+        raise ModelNotFoundError(f"no model {name!r}", hint=f"known: {', '.join(models) or 'none'}")
+    return load_bundle(models[name])

@@ -1,0 +1,76 @@
+"""The losses of §3.3 (Eq. 3 to 7), all in the patch's own units: lengths are fractions of the radius r."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+LossName = Literal["bilateral", "projection", "l2"]
+LOSSES: tuple[LossName, ...] = get_args(LossName)
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """Which loss, and every constant in it."""
+
+    loss: LossName = "bilateral"
+    """bilateral: Eq. 7. projection: Eq. 3. l2: squared distance to the nearest clean point (Table 5's ablation)."""
+    eta: float = 0.97
+    """Weight of the projection term; 1 - eta is the repulsion's (Eq. 5)."""
+    sigma_p: float = 0.0
+    """Support of phi (Eq. 4) in units of r; 0 takes the paper's 4·sqrt(diag/m) from every patch."""
+    sigma_p_points: int = 500
+    """The paper's m in sigma_p."""
+    sigma_n_degrees: float = 15.0
+    """Support angle of theta (Eq. 6)."""
+    theta_squared: bool = False
+    """Square the exponent of theta, as the authors' published code does."""
+    tangential_weight: float = 0.0
+    """Weight of the displacement's length along the surface. Not in the paper: keeps points from bunching up."""
+
+
+def filtering_loss(
+    displacements: Tensor, clean: Tensor, normals: Tensor, present: Tensor, settings: LossSettings
+) -> Tensor:
+    """The loss of each patch: (B,).
+
+    displacements: (B, 3), the network's answer, so the filtered point itself (the patch is centred).
+    clean, normals: (B, M, 3), the clean points in the ball with their unit normals. present: (B, M) bool, False where
+    a row is padding. A patch without clean points costs nothing.
+    """
+    offsets = displacements[:, None, :] - clean
+    squared = offsets.square().sum(dim=2)
+    nearest = squared.masked_fill(~present, math.inf).argmin(dim=1)
+    rows = torch.arange(len(clean))
+    nearest_normals = normals[rows, nearest]
+    if settings.loss == "l2":
+        main = squared[rows, nearest]
+    else:
+        distances = (offsets * normals).sum(dim=2).abs()
+        weights = torch.exp(-squared / _sigma_p(clean, present, settings)[:, None].square())
+        if settings.loss == "bilateral":
+            exponent = (1 - (nearest_normals[:, None, :] * normals).sum(dim=2)) / (
+                1 - math.cos(math.radians(settings.sigma_n_degrees))
+            )
+            weights = weights * torch.exp(-(exponent.square() if settings.theta_squared else exponent))
+        weights = weights * present
+        main = (distances * weights).sum(dim=1) / weights.sum(dim=1).clamp_min(1e-12)
+    repulsion = squared.masked_fill(~present, 0.0).amax(dim=1).clamp_min(1e-12).sqrt()
+    loss = settings.eta * main + (1 - settings.eta) * repulsion
+    if settings.tangential_weight:
+        along = displacements - (displacements * nearest_normals).sum(dim=1, keepdim=True) * nearest_normals
+        loss = loss + settings.tangential_weight * (along.square().sum(dim=1) + 1e-12).sqrt()
+    return torch.where(present.any(dim=1), loss, torch.zeros_like(loss))
+
+
+def _sigma_p(clean: Tensor, present: Tensor, settings: LossSettings) -> Tensor:
+    if settings.sigma_p:
+        return torch.full((len(clean),), settings.sigma_p)
+    high = clean.masked_fill(~present[:, :, None], -math.inf).amax(dim=1)
+    low = clean.masked_fill(~present[:, :, None], math.inf).amin(dim=1)
+    diagonal = (high - low).clamp_min(1e-6).nan_to_num(nan=1.0, posinf=1.0, neginf=1.0).norm(dim=1)
+    return 4 * torch.sqrt(diagonal / settings.sigma_p_points)

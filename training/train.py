@@ -1,0 +1,253 @@
+"""The training loop: settings, checkpoints, log, resume. `python -m training --help` says how to run it."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from tqdm import tqdm
+
+from pointfilter.filtering import filter_points
+from pointfilter.metrics import chamfer_distance
+from training.dataset import DataSettings, TrainingCloud, batches_ahead, cut_batch, training_clouds, validation_cloud
+from training.losses import LossSettings, filtering_loss
+from training.network import NetworkSettings, Pointfilter
+
+CHECKPOINT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """One run. Saved whole in the checkpoint, so that `--resume` needs nothing else."""
+
+    network: NetworkSettings = field(default_factory=NetworkSettings)
+    data: DataSettings = field(default_factory=DataSettings)
+    loss: LossSettings = field(default_factory=LossSettings)
+    steps: int = 60_000
+    optimizer: str = "adamw"
+    """adamw (default) or sgd (the paper's, §3.4)."""
+    learning_rate: float = 2e-3
+    schedule: str = "one-cycle"
+    """one-cycle (default) or exponential: from learning_rate down to final_learning_rate, as in the paper."""
+    final_learning_rate: float = 1e-8
+    weight_decay: float = 1e-4
+    gradient_clip: float = 1.0
+    ema_decay: float = 0.999
+    """The weights that are exported are an exponential moving average; 0 exports the last ones."""
+    precision: str = "auto"
+    """auto: bfloat16 products where the CPU multiplies them in hardware (AMX, AVX512-BF16), else float32."""
+    threads: int = 0
+    """0: one a core."""
+    validate_every: int = 2_000
+    validation_clouds: int = 4
+    checkpoint_every: int = 500
+    seed: int = 0
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> TrainingSettings:
+        values = dict(values)
+        data = dict(values["data"], noise_kinds=tuple(values["data"]["noise_kinds"]))
+        values["network"] = NetworkSettings.from_dict(values["network"])
+        values["data"] = DataSettings(**data)
+        values["loss"] = LossSettings(**values["loss"])
+        return cls(**values)
+
+
+class Run:
+    """A training run in a folder: checkpoint.pt (everything), log.csv (the loss curve), settings.json."""
+
+    def __init__(
+        self, folder: Path, settings: TrainingSettings, resume: bool, init: dict[str, Tensor] | None = None
+    ) -> None:
+        self.folder = folder
+        self.settings = settings
+        torch.manual_seed(settings.seed)
+        torch.set_num_threads(settings.threads or os.cpu_count() or 1)
+        self.network = Pointfilter(settings.network)
+        if init is not None:
+            self.network.load_state_dict(init)
+        moving_average = get_ema_multi_avg_fn(settings.ema_decay)  # type: ignore[no-untyped-call]
+        self.average = AveragedModel(self.network, multi_avg_fn=moving_average, use_buffers=True)
+        self.optimizer = self._optimizer()
+        self.scheduler = self._scheduler()
+        self.step = 0
+        self.seconds = 0.0
+        self.history: list[dict[str, float]] = []
+        if resume:
+            self._load(folder / "checkpoint.pt")
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "settings.json").write_text(json.dumps(dataclasses.asdict(settings), indent=2) + "\n")
+
+    def _optimizer(self) -> torch.optim.Optimizer:
+        if self.settings.optimizer == "sgd":
+            return torch.optim.SGD(self.network.parameters(), self.settings.learning_rate, momentum=0.9)
+        return torch.optim.AdamW(
+            self.network.parameters(), self.settings.learning_rate, weight_decay=self.settings.weight_decay
+        )
+
+    def _scheduler(self) -> torch.optim.lr_scheduler.LRScheduler:
+        settings = self.settings
+        if settings.schedule == "exponential":
+            gamma = (settings.final_learning_rate / settings.learning_rate) ** (1 / settings.steps)
+            return torch.optim.lr_scheduler.ExponentialLR(self.optimizer, gamma)
+        return torch.optim.lr_scheduler.OneCycleLR(
+            self.optimizer, settings.learning_rate, total_steps=settings.steps + 1, pct_start=0.15, cycle_momentum=False
+        )
+
+    def _load(self, path: Path) -> None:
+        state = torch.load(path, weights_only=True)
+        self.network.load_state_dict(state["network"])
+        self.average.load_state_dict(state["average"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.scheduler.load_state_dict(state["scheduler"])
+        self.step, self.seconds, self.history = state["step"], state["seconds"], state["history"]
+
+    def save(self) -> None:
+        """Writes the checkpoint so that a kill at any moment leaves the old one or the new one, whole."""
+        state = {
+            "version": CHECKPOINT_VERSION,
+            "settings": dataclasses.asdict(self.settings),
+            "step": self.step,
+            "seconds": self.seconds,
+            "history": self.history,
+            "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "scheduler": self.scheduler.state_dict(),
+        }
+        partial = self.folder / "checkpoint.pt.partial"
+        with partial.open("wb") as file:
+            torch.save(state, file)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(self.folder / "checkpoint.pt")
+        if self.history:
+            partial = self.folder / "log.csv.partial"
+            with partial.open("w", newline="") as text:
+                writer = csv.DictWriter(text, fieldnames=list(self.history[-1]))
+                writer.writeheader()
+                writer.writerows(self.history)
+            partial.replace(self.folder / "log.csv")
+
+    def train(self, clouds: list[TrainingCloud], until: int | None = None) -> None:
+        """Trains to the last step, or stops (with a checkpoint) after step `until`."""
+        settings = self.settings
+        last = min(until or settings.steps, settings.steps)
+        bfloat16 = _use_bfloat16(settings.precision)
+        validation = [validation_cloud(number, settings.data) for number in range(settings.validation_clouds)]
+        self.network.train()
+        recent: list[float] = []
+        started = time.perf_counter()
+        spent = self.seconds
+        progress = tqdm(initial=self.step, total=settings.steps, unit="batch", smoothing=0.05)
+        for batch in batches_ahead(clouds, settings.data, self.step, last):
+            with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+                displacements = self.network(batch.patches)
+            loss = filtering_loss(displacements, batch.clean, batch.normals, batch.present, settings.loss).mean()
+            self.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_clip)
+            self.optimizer.step()
+            self.scheduler.step()
+            self.average.update_parameters(self.network)
+            self.step += 1
+            self.seconds = spent + time.perf_counter() - started
+            recent.append(loss.item())
+            progress.update()
+            if self.step % settings.validate_every == 0 or self.step == settings.steps:
+                row: dict[str, float] = {
+                    "step": self.step,
+                    "patches": self.step * settings.data.batch,
+                    "hours": round(self.seconds / 3600, 4),
+                    "patches_per_second": round(self.step * settings.data.batch / self.seconds, 1),
+                    "learning_rate": float(self.scheduler.get_last_lr()[0]),
+                    "loss": float(np.mean(recent)),
+                    **self._validate(validation),
+                }
+                recent.clear()
+                self.history.append(row)
+                progress.write("  ".join(f"{name} {value:.6g}" for name, value in row.items()))
+            if self.step % settings.checkpoint_every == 0:
+                self.save()
+        progress.close()
+        self.save()
+
+    def _validate(self, clouds: list[TrainingCloud]) -> dict[str, float]:
+        """The averaged network on shapes it never saw: its loss, and CD after one and two iterations."""
+        if not clouds:
+            return {}
+        settings = self.settings
+        network = cast("Pointfilter", self.average.module) if settings.ema_decay else self.network
+        network.eval()
+        data = dataclasses.replace(settings.data, batch=256, clouds_per_batch=len(clouds), seed=settings.data.seed + 1)
+        with torch.inference_mode():
+            batch = cut_batch(clouds, data, 0)
+            displacements = network(batch.patches)
+            loss = filtering_loss(displacements, batch.clean, batch.normals, batch.present, settings.loss).mean().item()
+        distances = []
+        for cloud in clouds:
+            filtered = cloud.points
+            row = [chamfer_distance(cloud.clean, filtered)]
+            for iteration in range(2):
+                filtered = filter_points(
+                    filtered,
+                    predictor(network),
+                    radius=cloud.index.radius,
+                    iterations=1,
+                    patch_points=settings.data.patch_points,
+                    seed=iteration,
+                )
+                row.append(chamfer_distance(cloud.clean, filtered))
+            distances.append(row)
+        noisy, once, twice = (1e5 * np.mean(distances, axis=0)).tolist()
+        network.train(network is self.network)
+        return {"validation_loss": loss, "noisy_cd": noisy, "cd_1": once, "cd_2": twice}
+
+
+def predictor(network: Pointfilter) -> Any:
+    """The network as the plain callable that the core expects: (B, N, 3) float32 -> (B, 3) float32."""
+
+    def predict(patches: np.ndarray) -> np.ndarray:
+        with torch.inference_mode():
+            answer: np.ndarray = network(torch.from_numpy(patches)).numpy()
+            return answer
+
+    return predict
+
+
+def _use_bfloat16(precision: str) -> bool:
+    if precision == "auto":
+        return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
+    return precision == "bfloat16"
+
+
+def start(
+    folder: Path,
+    settings: TrainingSettings,
+    *,
+    resume: bool = False,
+    meshes: Path | None = None,
+    clouds: Path | None = None,
+    init: dict[str, Tensor] | None = None,
+    until: int | None = None,
+) -> Run:
+    """Starts or resumes a run and trains it to its end (or to step `until`)."""
+    if resume:
+        saved = torch.load(folder / "checkpoint.pt", weights_only=True)
+        settings = TrainingSettings.from_dict(saved["settings"])
+    run = Run(folder, settings, resume, init)
+    total = None if clouds else settings.data.clouds
+    pool = list(tqdm(training_clouds(settings.data, meshes, clouds), total=total, unit="cloud", desc="clouds"))
+    run.train(pool, until)
+    return run
