@@ -33,6 +33,9 @@ ROWS_PER_BATCH = (
 )
 
 
+CENTRES_PER_COUNT = 1024  # centres whose neighbours are counted between two looks at `cancelled`
+
+
 @dataclass
 class Timings:
     """Seconds spent, by stage. `patches` and `infer` are summed over the workers."""
@@ -59,20 +62,20 @@ def resolve_radius(points: Float64, radius: float | None, fraction: float = DEFA
     """The absolute radius: the given one, or `fraction` of the bounding-box diagonal of the (n, 3) points.
 
     Raises ParameterError for a radius that is not a finite number above 0, DegenerateCloudError when the points have no
-    extent to take a fraction of.
+    extent to take a fraction of, or one beyond double precision.
     """
+    diagonal = bounding_box_diagonal(points)
+    if not np.isfinite(diagonal):  # squares of such distances would overflow
+        raise DegenerateCloudError("the extent of the cloud is beyond double precision", hint="remove the stray points")
     if radius is not None:
         if not (np.isfinite(radius) and radius > 0):
             raise ParameterError("radius must be a finite number above 0", limit=0, actual=radius)
         return float(radius)
-    diagonal = bounding_box_diagonal(points)
     if not diagonal > 0:
         raise DegenerateCloudError(
             "all points are at the same place, so there is no extent to take a radius from",
             hint="pass radius in the units of the file",
         )
-    if not np.isfinite(diagonal):
-        raise DegenerateCloudError("the extent of the cloud is beyond double precision", hint="remove the stray points")
     return diagonal * fraction
 
 
@@ -98,6 +101,9 @@ def filter_points(
 
     Raises TooFewPointsError, DegenerateCloudError, ParameterError, FilteringCancelledError.
     """
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points must have shape (n, 3), got {points.shape}")
     if len(points) < MIN_NEIGHBOURS:
         raise TooFewPointsError(
             f"a cloud needs at least {MIN_NEIGHBOURS} finite points, this one has {len(points)}",
@@ -110,9 +116,15 @@ def filter_points(
         )
     if not 0 <= seed < 2**63:
         raise ParameterError(f"seed must be from 0 to 2^63 - 1, got {seed}", actual=seed)
+    for name, value in (("patch_points", patch_points), ("threads", threads)):
+        if value < 1:
+            raise ParameterError(f"{name} must be at least 1, got {value}", limit=1, actual=value)
+    if not np.isfinite(points).all():
+        raise ParameterError("points must be finite", hint="filter_cloud leaves rows with NaN or Inf alone")
     absolute_radius = resolve_radius(points, radius)
     timings = timings or Timings()
-    offset = (points.min(axis=0) + points.max(axis=0)) / 2  # large coordinates must not cost digits
+    low, high = points.min(axis=0), points.max(axis=0)
+    offset = low + (high - low) / 2  # large coordinates must not cost digits
     moved = points - offset
     ids = stable_ids(moved)
     for iteration in range(iterations):
@@ -158,7 +170,7 @@ def _one_pass(
         return len(chosen)
 
     with timings.measure("patches"):
-        counts = _count(index, centres, threads)
+        counts = _count(index, centres, threads, cancelled)
 
     def tasks() -> Iterator[tuple[NDArray[np.int64], int]]:
         for length, positions in length_buckets(counts, patch_points):
@@ -189,7 +201,16 @@ def _one_pass(
     return result
 
 
-def _count(index: NeighbourIndex, centres: Float64, threads: int) -> NDArray[np.int64]:
-    parts = np.array_split(centres, max(1, min(4 * threads, len(centres) // 1024)))
+def _count(
+    index: NeighbourIndex, centres: Float64, threads: int, cancelled: Callable[[], bool] | None
+) -> NDArray[np.int64]:
+    """Neighbours of every centre. Balls that hold most of the cloud make this slow, so it can be cancelled too."""
+    counts = [np.empty(0, dtype=np.int64)]
     with ThreadPoolExecutor(threads, thread_name_prefix="count") as pool:
-        return np.concatenate(list(pool.map(index.count, parts)))
+        starts = range(0, len(centres), CENTRES_PER_COUNT)
+        for first in range(0, len(starts), threads):
+            parts = [centres[start : start + CENTRES_PER_COUNT] for start in starts[first : first + threads]]
+            counts += pool.map(index.count, parts)
+            if cancelled is not None and cancelled():
+                raise FilteringCancelledError("filtering was cancelled")
+    return np.concatenate(counts)

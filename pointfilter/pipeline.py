@@ -12,7 +12,7 @@ import numpy as np
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import ParameterError
-from pointfilter.filtering import Timings, filter_points, resolve_radius
+from pointfilter.filtering import MIN_NEIGHBOURS, Timings, filter_points, resolve_radius
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,9 @@ def filter_cloud(
     timings = Timings()
     if radius is None:
         radius = Radius(bundle.radius, relative=True)
-    absolute = resolve_radius(points, None, radius.value) if radius.relative and len(points) else radius.value
+    # Too few points are filter_points' business, and have no extent to speak of.
+    share_of_extent = radius.relative and len(points) >= MIN_NEIGHBOURS
+    absolute = resolve_radius(points, None, radius.value) if share_of_extent else radius.value
     filtered = filter_points(
         points,
         engine,

@@ -88,6 +88,13 @@ def _faceted(vertices: Float64, faces: NDArray[np.int64]) -> Mesh:
     return Mesh(vertices, faces[solid], np.repeat(normals[:, None, :], 3, axis=1))
 
 
+def mesh_of(solid: manifold3d.Manifold) -> Mesh:
+    """The faceted mesh of a manifold3d solid, with a diagonal of 1."""
+    mesh = solid.to_mesh()
+    vertices = np.asarray(mesh.vert_properties, dtype=np.float64)[:, :3]
+    return _faceted(vertices, np.asarray(mesh.tri_verts, dtype=np.int64))
+
+
 # --- CAD solids: booleans of primitives -------------------------------------------------------------------------
 
 
@@ -147,11 +154,7 @@ def _solid(rng: Rng) -> Mesh | None:
             solid = solid + _placed(_primitive(rng).scale([0.8, 0.8, 0.8]), rng, 0.4)
         else:
             solid = solid ^ _placed(_primitive(rng).scale([1.6, 1.6, 1.6]), rng, 0.2)
-    mesh = solid.to_mesh()
-    faces = np.asarray(mesh.tri_verts, dtype=np.int64)
-    if len(faces) < 12:
-        return None
-    return _faceted(np.asarray(mesh.vert_properties, dtype=np.float64)[:, :3], faces)
+    return None if solid.num_tri() < 12 else mesh_of(solid)
 
 
 # --- Smooth shapes: level sets through marching cubes -----------------------------------------------------------

@@ -122,9 +122,9 @@ class _Parser:
         self.obj_info: list[str] = []
 
     def line(self, number: int, line: bytes) -> None:
-        # Comments may be in any encoding; Latin-1 never fails and the bytes themselves are kept in `raw`.
-        text = line.decode("latin-1").strip()
-        keyword, _, rest = text.partition(" ")
+        text = _decoded(line).strip()
+        keyword, *others = text.split(None, 1) or [""]
+        rest = others[0] if others else ""
         if keyword == "comment":
             self.comments.append(rest)
         elif keyword == "obj_info":
@@ -136,7 +136,7 @@ class _Parser:
         elif keyword == "property":
             self._property(number, rest.split())
         elif text:
-            raise MalformedFileError(f"line {number}: {_shown(text)} is no PLY header line")
+            raise MalformedFileError(f"line {number}: {shown(text)} is no PLY header line")
 
     def _format(self, number: int, words: list[str]) -> None:
         if self.encoding:
@@ -144,7 +144,7 @@ class _Parser:
         if len(words) != 2 or words[0] not in ENCODINGS or words[1] != "1.0":
             raise MalformedFileError(
                 f"line {number}: the format must be one of {', '.join(ENCODINGS)} with version 1.0, "
-                f"not {_shown(' '.join(words))}"
+                f"not {shown(' '.join(words))}"
             )
         self.encoding = words[0]
 
@@ -153,10 +153,10 @@ class _Parser:
             raise MalformedFileError(f"line {number}: an element before the format line")
         if len(words) != 2 or not (words[1].isascii() and words[1].isdigit()) or len(words[1]) > 18:
             raise MalformedFileError(
-                f"line {number}: an element needs a name and a count, not {_shown(' '.join(words))}"
+                f"line {number}: an element needs a name and a count, not {shown(' '.join(words))}"
             )
         if any(words[0] == name for name, _, _ in self.elements):
-            raise MalformedFileError(f"line {number}: a second element {_shown(words[0])}")
+            raise MalformedFileError(f"line {number}: a second element {shown(words[0])}")
         self.elements.append((words[0], int(words[1]), []))
 
     def _property(self, number: int, words: list[str]) -> None:
@@ -165,12 +165,12 @@ class _Parser:
         is_list = words[:1] == ["list"]
         types = words[1:-1] if is_list else words[:-1]
         if len(types) != (2 if is_list else 1) or not all(type in TYPES for type in types):
-            raise MalformedFileError(f"line {number}: {_shown(' '.join(words))} is no property")
+            raise MalformedFileError(f"line {number}: {shown(' '.join(words))} is no property")
         if is_list and TYPES[types[0]].startswith("f"):
             raise MalformedFileError(f"line {number}: the length of a list must be an integer type, not {types[0]}")
         properties = self.elements[-1][2]
         if any(property.name == words[-1] for property in properties):
-            raise MalformedFileError(f"line {number}: a second property {_shown(words[-1])} in one element")
+            raise MalformedFileError(f"line {number}: a second property {shown(words[-1])} in one element")
         properties.append(Property(words[-1], types[-1], types[0] if is_list else None))
 
     def finish(self, raw: bytes, ending: bytes, raw_size: int) -> Header:
@@ -206,6 +206,14 @@ def _check(header: Header, file_size: int, limits: ReadLimits) -> None:
         )
 
 
-def _shown(text: str) -> str:
+def _decoded(line: bytes) -> str:
+    """Comments may be in any encoding: UTF-8 where it is, else Latin-1, which never fails. `raw` keeps the bytes."""
+    try:
+        return line.decode()
+    except UnicodeDecodeError:
+        return line.decode("latin-1")
+
+
+def shown(text: str) -> str:
     """Text from outside, short and harmless enough for a message."""
     return ascii(text if len(text) <= 60 else text[:57] + "...")

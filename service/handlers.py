@@ -1,0 +1,66 @@
+"""Exceptions to answers: each becomes a problem of service.problems.TYPES."""
+
+from __future__ import annotations
+
+import errno
+import logging
+
+from fastapi import FastAPI
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
+
+from pointfilter.errors import ParameterError, PointfilterError
+from service.errors import StorageFullError
+from service.problems import TYPES, problem_response
+
+log = logging.getLogger("service.problems")
+
+_ROUTING = {404: "not-found", 405: "method-not-allowed"}
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def install_handlers(app: FastAPI) -> None:
+    app.add_exception_handler(PointfilterError, _pointfilter)
+    app.add_exception_handler(RequestValidationError, _validation)
+    app.add_exception_handler(HTTPException, _http)
+    app.add_exception_handler(OSError, _os)
+
+
+async def _pointfilter(request: Request, error: Exception) -> Response:
+    assert isinstance(error, PointfilterError)  # noqa: S101 - what it is installed for
+    code = error.code if error.code in TYPES else "error"
+    if TYPES[code].private:
+        log.error("%s: %s", type(error).__name__, error, exc_info=error)
+    return problem_response(request, code, error)
+
+
+async def _validation(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)  # noqa: S101
+    first = error.errors()[0]
+    name = str(first["loc"][-1])
+    told = ParameterError(f"{name}: {first['msg']}", actual=_short(first.get("input")))
+    return problem_response(request, "parameter-out-of-range", told)
+
+
+async def _http(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)  # noqa: S101
+    code = _ROUTING.get(error.status_code)
+    if code is None:
+        raise error  # nothing of ours raises any other: an error like all unexpected ones
+    return problem_response(request, code, headers=dict(error.headers or {}))
+
+
+async def _os(request: Request, error: Exception) -> Response:
+    if not (isinstance(error, OSError) and error.errno in _FULL):
+        raise error
+    log.error("no room for temporary files: %s", error.strerror)
+    full = StorageFullError("there is no room left for the upload or the result", retry_after=30)
+    return problem_response(request, full.code, full)
+
+
+def _short(value: object) -> str | float | None:
+    if value is None or isinstance(value, (int, float)):
+        return value
+    return str(value)[:60]

@@ -1,0 +1,156 @@
+"""POST /filter: a noisy cloud in, the clean one out, in one request."""
+
+from __future__ import annotations
+
+import asyncio
+from functools import partial
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query, Request
+from starlette.responses import Response
+
+from pointfilter.errors import ParameterError
+from pointfilter.pipeline import Radius
+from service.dependencies import AdmittedFolder, ExchangeDep, HouseDep, Ready
+from service.download import FileDownload, content_disposition
+from service.errors import DeadlineError
+from service.exchange import Exchange
+from service.house import House
+from service.problems import answers
+from service.settings import variable
+from service.upload import receive_upload
+from service.work import Delivery, Order, cancelled_on_disconnect, carry_out, in_worker
+
+router = APIRouter()
+
+_HEADERS = {
+    "Content-Disposition": "attachment, with the name of the upload and `_filtered`",
+    "Server-Timing": "Milliseconds by stage; patches and infer are summed over the threads",
+    "X-Request-ID": "The caller's, where it sent a sane one",
+    "X-Model": "Name of the model that was used",
+    "X-Points": "Points in the file",
+    "ETag": "sha256 of the file",
+}
+_FILE = {"type": "string", "format": "binary"}
+_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The filtered file: moved coordinates, everything else as it came",
+        "content": {"application/octet-stream": {"schema": _FILE}},
+        "headers": {name: {"description": text, "schema": {"type": "string"}} for name, text in _HEADERS.items()},
+    },
+    **answers(
+        "malformed-request", "malformed-file", "invalid-input", "model-not-found", "slow-upload", "limit-exceeded",
+        "unsupported-format", "unsupported-coding", "missing-coordinates", "too-few-points", "degenerate-cloud",
+        "parameter-out-of-range", "queue-full", "client-closed", "cancelled", "internal-error", "error", "model-error",
+        "invalid-model", "not-ready", "draining", "provider-unavailable", "storage-full", "deadline-exceeded",
+    ),
+}  # fmt: skip
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "description": "The file, as the only part of a form or as the body itself",
+        "content": {
+            "multipart/form-data": {
+                "schema": {"type": "object", "properties": {"file": _FILE}, "required": ["file"]},
+            },
+            "application/octet-stream": {"schema": _FILE},
+        },
+    }
+}
+
+
+@router.post(
+    "/filter",
+    summary="Filter a point cloud",
+    tags=["filter"],
+    dependencies=[Ready],
+    response_class=FileDownload,
+    responses=_ANSWERS,
+    openapi_extra=_BODY,
+)
+async def filter_file(
+    request: Request,
+    house: HouseDep,
+    exchange: ExchangeDep,
+    folder: AdmittedFolder,
+    model: Annotated[str | None, Query(description="A name from /models", max_length=100)] = None,
+    iterations: Annotated[int | None, Query(description="Passes over the cloud; by default the model's", ge=1)] = None,
+    radius: Annotated[
+        str | None,
+        Query(
+            description="Patch radius: a share of the bounding box's diagonal (5%, in an address 5%25) or a length in "
+            "the unit of the file (0.02); by default the model's",
+            max_length=40,
+        ),
+    ] = None,
+    seed: Annotated[int, Query(description="Of the choice of neighbours in dense patches", ge=0, lt=2**63)] = 0,
+    format: Annotated[  # noqa: A002 - the parameter's public name
+        Literal["same", "ascii", "binary_little_endian", "binary_big_endian"],
+        Query(description="Encoding of the answer"),
+    ] = "same",
+) -> Response:
+    order = await _order(house, exchange, model, iterations, radius, seed, format)
+    upload = await receive_upload(request, folder / "input.ply", house.settings)
+    target = folder / "output.ply"
+    work = partial(carry_out, order, upload.path, target, house.engines.engine, house.settings.read_limits)
+    try:
+        async with (
+            asyncio.timeout(house.settings.timeout_seconds),
+            cancelled_on_disconnect(request),
+            house.admission.worker() as waited,
+        ):
+            house.telemetry.waited(waited)
+            delivery = await in_worker(house.workers, work)
+    except TimeoutError:
+        raise DeadlineError(
+            f"the result was not there after {house.settings.timeout_seconds:g} s; the work was stopped",
+            limit=house.settings.timeout_seconds,
+            hint=f"send less, or whoever runs the service can raise {variable('timeout_seconds')}",
+        ) from None
+    house.telemetry.delivered(delivery)
+    exchange.points = delivery.report.points
+    return FileDownload(
+        target,
+        delivery.size,
+        house.settings.transfer_seconds,
+        {
+            "Content-Disposition": content_disposition(upload.file_name),
+            "Server-Timing": _server_timing(delivery, waited),
+            "X-Model": delivery.report.model,
+            "X-Points": str(delivery.report.points),
+            "ETag": f'"{delivery.sha256}"',
+        },
+    )
+
+
+async def _order(
+    house: House,
+    exchange: Exchange,
+    model: str | None,
+    iterations: int | None,
+    radius: str | None,
+    seed: int,
+    encoding: str,
+) -> Order:
+    """Checks what can be checked before the upload. Raises ParameterError, ModelError."""
+    bundle = await asyncio.to_thread(house.engines.bundle, model or house.settings.model)
+    exchange.model = bundle.name
+    if iterations is not None and iterations > house.settings.max_iterations:
+        raise ParameterError(
+            f"iterations must be from 1 to {house.settings.max_iterations}, got {iterations}",
+            limit=house.settings.max_iterations,
+            actual=iterations,
+            hint=f"whoever runs the service can raise {variable('max_iterations')}",
+        )
+    return Order(
+        model=model or house.settings.model,
+        iterations=iterations,
+        radius=None if radius is None else Radius.parse(radius),
+        seed=seed,
+        encoding=encoding,
+    )
+
+
+def _server_timing(delivery: Delivery, waited: float) -> str:
+    stages = {"queue": waited, **delivery.seconds}
+    return ", ".join(f"{stage};dur={1000 * seconds:.1f}" for stage, seconds in stages.items())

@@ -1,0 +1,101 @@
+"""Metrics for Prometheus: base units, histograms, labels with few values, never a name that a client sent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    GCCollector,
+    Histogram,
+    PlatformCollector,
+    ProcessCollector,
+    generate_latest,
+)
+from prometheus_client.exposition import CONTENT_TYPE_LATEST
+
+from pointfilter.engine import Engine
+from service.admission import Admission
+from service.exchange import Exchange
+from service.problems import TYPES
+from service.work import Delivery
+
+MEDIA_TYPE = CONTENT_TYPE_LATEST
+STAGES = ("parse", "index", "patches", "infer", "write")
+SECONDS = (0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120, 300, 600)
+STAGE_SECONDS = (0.001, 0.005, 0.01, 0.05, 0.1, 0.5, 1, 5, 10, 30, 60, 300, 600)
+POINTS = (1e3, 1e4, 5e4, 1e5, 2.5e5, 5e5, 1e6, 2.5e6, 5e6, 1e7)
+UNKNOWN_MODEL = "unknown"
+
+
+class Telemetry:
+    """The metrics of one app, in a registry of its own."""
+
+    def __init__(self, admission: Admission) -> None:
+        registry = self.registry = CollectorRegistry()
+        ProcessCollector(registry=registry)
+        PlatformCollector(registry=registry)
+        GCCollector(registry=registry)
+        self._requests = Counter(
+            "pointfilter_requests", "Filter requests by how they ended", ["model", "outcome"], registry=registry
+        )
+        self._request_seconds = Histogram(
+            "pointfilter_request_duration_seconds",
+            "Filter requests that ended well, first byte in to last byte out",
+            ["model"],
+            buckets=SECONDS,
+            registry=registry,
+        )
+        self._stage_seconds = Histogram(
+            "pointfilter_stage_duration_seconds",
+            "Time in a stage; patches and infer are summed over the threads",
+            ["stage"],
+            buckets=STAGE_SECONDS,
+            registry=registry,
+        )
+        self._queue_wait = Histogram(
+            "pointfilter_queue_wait_seconds", "Time waited for a worker", buckets=(0.001, *SECONDS), registry=registry
+        )
+        self._points = Counter("pointfilter_points", "Points filtered", ["model"], registry=registry)
+        self._points_per_request = Histogram(
+            "pointfilter_points_per_request", "Points of a cloud", buckets=POINTS, registry=registry
+        )
+        self._model_info = Gauge(
+            "pointfilter_model_info", "1 for each model in memory", ["model", "version", "sha256", "provider"],
+            registry=registry,
+        )  # fmt: skip
+        depth = Gauge("pointfilter_queue_depth", "Requests waiting for a worker", registry=registry)
+        depth.set_function(lambda: admission.waiting)
+        running = Gauge("pointfilter_in_progress", "Requests being worked on", registry=registry)
+        running.set_function(lambda: admission.running)
+        Gauge("pointfilter_workers", "Workers", registry=registry).set(admission.workers)
+        for stage in STAGES:
+            self._stage_seconds.labels(stage)  # there from the start, so that a rate sees the first one
+
+    def waited(self, seconds: float) -> None:
+        self._queue_wait.observe(seconds)
+
+    def delivered(self, delivery: Delivery) -> None:
+        """Work that was done, whether or not anybody fetches it."""
+        for stage, seconds in delivery.seconds.items():
+            self._stage_seconds.labels(stage).observe(seconds)
+        self._points.labels(delivery.report.model).inc(delivery.report.points)
+        self._points_per_request.observe(delivery.report.points)
+
+    def filter_ended(self, exchange: Exchange, seconds: float) -> None:
+        model = exchange.model or UNKNOWN_MODEL
+        outcome = TYPES[exchange.code].outcome if exchange.code else "ok"
+        self._requests.labels(model, outcome).inc()
+        if outcome == "ok":
+            self._request_seconds.labels(model).observe(seconds)
+
+    def models_loaded(self, engines: Sequence[Engine]) -> None:
+        self._model_info.clear()
+        for engine in engines:
+            bundle = engine.bundle
+            self._model_info.labels(bundle.name, bundle.version, bundle.sha256, engine.provider).set(1)
+
+    def exposition(self) -> bytes:
+        return generate_latest(self.registry)

@@ -1,0 +1,62 @@
+"""Runs every attack of a folder in a process that may not grow: `python -W error -m tests.attacks.run FOLDER`.
+
+Prints one JSON object: by attack's name, the error that came out and the seconds it took.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from pointfilter import PointCloud, filter_cloud
+from tests.attacks.files import ATTACKS
+from tests.clouds import pooled
+
+MEMORY = 256 << 20  # bytes that the process may grow by; the largest file that is read whole has 20 MB
+
+
+class FakeEngine:
+    bundle = SimpleNamespace(name="fake", version="0", sha256="0" * 64, iterations=2, radius=0.05, patch_points=64)
+    provider = "none"
+    threads = 1
+
+    def __call__(self, patches: np.ndarray) -> np.ndarray:
+        return pooled(patches)
+
+
+def main(folder: Path) -> None:
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    results = {}
+    for attack in ATTACKS:
+        path, target = folder / "attack.ply", folder / "result.ply"
+        attack.write(path)
+        # Files are mapped, so what a file itself takes is not counted.
+        resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY + path.stat().st_size, resource.RLIM_INFINITY))
+        started = time.perf_counter()
+        error: BaseException | None = None
+        try:
+            filter_cloud(PointCloud.read(path), FakeEngine())[0].write(target)
+        except Exception as caught:  # noqa: BLE001 - which one it is, is the question
+            error = caught
+        seconds = time.perf_counter() - started
+        resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        results[attack.name] = {
+            "error": type(error).__name__ if error else None,
+            "message": str(error) if error else "",
+            "seconds": seconds,
+            "left": sorted(entry.name for entry in folder.iterdir() if entry.name not in ("attack.ply", "result.ply")),
+            "written": target.is_file(),
+        }
+        path.unlink()
+        target.unlink(missing_ok=True)
+    print(json.dumps(results))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
