@@ -4,9 +4,9 @@
     python -m benchmarks.quality --data DIR --model NAME --iterations 1 2 4 --noise 0.005 0.01 --json scores.json
 
 DIR is laid out like the paper's test clouds: NAME.npy (clean), NAME_0.005.npy (noisy, row for row) and mesh/*.ply
-(surfaces; the one that fits a cloud is found by distance). The data is not part of this repository: POINTFILTER_BENCHMARK_DATA
-or --data says where it lies. CD ×1e5, P2F ×1e3, clean model scaled to a diagonal of 1 (§4.3). "limit" is the exact
-projection of the noisy points onto the surface: no filter that only moves points to the surface gets below its CD.
+(surfaces; the one that fits a cloud is found by distance). The data is not part of this repository: --data or
+POINTFILTER_BENCHMARK_DATA says where it lies. CD ×1e5, P2F ×1e3, clean model scaled to a diagonal of 1 (§4.3). "limit"
+is the exact projection of the noisy points onto the surface.
 """
 
 from __future__ import annotations
@@ -104,7 +104,13 @@ Row = dict[str, str | float]
 
 def _rows(subject: Subject, level: str, noisy: Float64, engine: Engine, options: argparse.Namespace) -> list[Row]:
     def row(method: str, points: Float64, seconds: float) -> Row:
-        found = {"noise": level, "cloud": subject.name, "method": method, **subject.scores(points), "seconds": seconds}
+        found: Row = {
+            "noise": level,
+            "cloud": subject.name,
+            "method": method,
+            **subject.scores(points),
+            "seconds": seconds,
+        }
         print(f"  {level} {subject.name}: {method}", file=sys.stderr)
         return found
 

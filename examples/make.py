@@ -57,7 +57,8 @@ def main() -> None:
         for colour, tint in (("red", 0.75), ("green", 0.85), ("blue", 1.0)):
             vertices[colour] = shade * tint
         vertices["scalar_intensity"] = intensity
-        _write(folder / f"bracket_{name}.ply", [plyfile.PlyElement.describe(vertices, "vertex")], f"bracket, {name}, mm")
+        element = plyfile.PlyElement.describe(vertices, "vertex")
+        _write(folder / f"bracket_{name}.ply", [element], f"bracket, {name}, mm")
     _write(folder / "bracket_mesh.ply", _mesh_elements(mesh), "bracket, surface, mm")
 
 

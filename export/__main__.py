@@ -1,5 +1,6 @@
 """Turn a checkpoint into a bundle that the command line and the service can load.
 
+    python -m export                                        # the newest run: runs/NAME -> bundles/NAME
     python -m export runs/mine/checkpoint.pt --out bundles/mine
     pointfilter filter scan.ply clean.ply --model bundles/mine
     POINTFILTER_MODEL_DIR=bundles make serve          # then POST /filter?model=mine
@@ -23,9 +24,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m export", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("checkpoint", type=Path, nargs="?", help="default: the newest runs/*/checkpoint.pt")
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="FOLDER", help="the bundle; its name names the model"
+        "--out", type=Path, metavar="FOLDER", help="the bundle; its name names the model (default: bundles/RUN)"
     )
     parser.add_argument("--version", default="0", help="of the weights, kept in model.json (default: %(default)s)")
     parser.add_argument("--iterations", type=int, default=2, help="default of the bundle (default: %(default)s)")
@@ -33,13 +34,23 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         scores = json.loads(options.scores.read_text()) if options.scores else None
-        loaded = load_checkpoint(options.checkpoint)
-        bundle, difference = write_bundle(loaded, options.out, options.version, options.iterations, scores)
+        checkpoint = options.checkpoint or newest_checkpoint(Path("runs"))
+        folder = options.out or Path("bundles", checkpoint.resolve().parent.name)
+        loaded = load_checkpoint(checkpoint)
+        bundle, difference = write_bundle(loaded, folder, options.version, options.iterations, scores)
     except (ValueError, OSError, ParityError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(f"{bundle.folder}: {bundle.parameters} parameters; torch and onnxruntime differ by {difference:.2g} r")
     return 0
+
+
+def newest_checkpoint(runs: Path) -> Path:
+    """The checkpoint that was written last. Raises FileNotFoundError where there is none."""
+    found = sorted(runs.glob("*/checkpoint.pt"), key=lambda path: path.stat().st_mtime)
+    if not found:
+        raise FileNotFoundError(f"no checkpoint in {runs}/: train first, or name one")
+    return found[-1]
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from export.checkpoint import Loaded
 from export.graph import OPSET, build
+from pointfilter.filtering import MAX_ITERATIONS
 from pointfilter.models import FRAME, SCHEMA, ModelBundle, load_bundle
 from pointfilter.patches import NeighbourIndex, stable_ids
 
@@ -31,8 +32,14 @@ def write_bundle(
 ) -> tuple[ModelBundle, float]:
     """Writes the bundle folder (its name is the model's name), whole or not at all.
 
-    Returns the bundle as the service will load it, and the parity error. Raises ParityError above PARITY_TOLERANCE.
+    Returns the bundle as the service will load it, and the parity error. Raises ParityError above PARITY_TOLERANCE,
+    ValueError where the folder is there and is no bundle.
     """
+    if not 1 <= iterations <= MAX_ITERATIONS:
+        raise ValueError(f"iterations must be from 1 to {MAX_ITERATIONS}, got {iterations}")
+    folder = folder.absolute()
+    if folder.exists() and not _is_bundle(folder):
+        raise ValueError(f"{folder} is there and is no bundle: choose another name, nothing is overwritten")
     model = build(loaded.network)
     serialised = model.SerializeToString()
     error = parity_error(loaded, serialised)
@@ -65,13 +72,28 @@ def write_bundle(
         partial.chmod(0o755)
         (partial / "model.onnx").write_bytes(serialised)
         (partial / "model.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
-        if folder.exists():
-            shutil.rmtree(folder)
-        partial.replace(folder)
-    except BaseException:
+        _exchange(partial, folder)
+    finally:
         shutil.rmtree(partial, ignore_errors=True)
-        raise
     return load_bundle(folder), error
+
+
+def _is_bundle(folder: Path) -> bool:
+    return folder.is_dir() and {path.name for path in folder.iterdir()} <= {"model.onnx", "model.json"}
+
+
+def _exchange(partial: Path, folder: Path) -> None:
+    """Puts the new folder in the place of the old one, if there is one; when that fails the old one is put back."""
+    if not folder.exists():
+        partial.replace(folder)
+        return
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as aside:
+        old = folder.rename(Path(aside) / folder.name)
+        try:
+            partial.replace(folder)
+        except BaseException:
+            old.rename(folder)
+            raise
 
 
 def parity_error(loaded: Loaded, serialised: bytes) -> float:

@@ -39,15 +39,22 @@ def load_checkpoint(path: Path) -> Loaded:
     except FileNotFoundError:
         raise
     except Exception as error:
-        raise ValueError(f"{path} is no checkpoint that can be read safely: {str(error).splitlines()[0]}") from error
+        raise ValueError(f"{path} is no checkpoint that can be read safely: {_first_line(error)}") from error
     if not isinstance(state, dict):
         raise ValueError(f"{path} holds a {type(state).__name__}, not a checkpoint")
-    if "settings" in state and "average" in state:
-        return _ours(state, path)
     weights = state.get("state_dict", state)
-    if isinstance(weights, dict) and all(key in weights for key in _AUTHORS_KEYS):
-        return _authors(weights)
+    try:
+        if "settings" in state and "average" in state:
+            return _ours(state, path)
+        if isinstance(weights, dict) and all(key in weights for key in _AUTHORS_KEYS):
+            return _authors(weights)
+    except (KeyError, TypeError, AttributeError, RuntimeError) as error:
+        raise ValueError(f"{path} is a damaged checkpoint: {_first_line(error)}") from error
     raise ValueError(f"{path} is neither a checkpoint of `python -m training` nor one of the authors' code")
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _ours(state: dict[str, Any], path: Path) -> Loaded:

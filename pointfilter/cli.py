@@ -8,6 +8,7 @@ results to stdout.
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import os
 import platform
@@ -25,7 +26,7 @@ from pointfilter import errors
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import DEVICES, Engine, available_cpus
 from pointfilter.evaluation import evaluate
-from pointfilter.formats import FORMATS
+from pointfilter.formats import FORMATS, format_of
 from pointfilter.formats.ply_header import ENCODINGS
 from pointfilter.models import DEFAULT_MODEL, ModelBundle, available_models, find_model, load_bundle
 from pointfilter.noise import bounding_box_diagonal
@@ -175,6 +176,9 @@ def _on_disk(source: str) -> Iterator[Path]:
 def _collected(target: str) -> Iterator[Path]:
     """Where to write: the output file itself, or a private one that then goes to stdout."""
     if target != "-":
+        format_of(Path(target))  # minutes of work must not end in a wrong suffix or a folder that is not there
+        if not Path(target).parent.is_dir():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(Path(target).parent))
         yield Path(target)
         return
     with tempfile.TemporaryDirectory(prefix="pointfilter-") as folder:
@@ -309,11 +313,16 @@ def _show(described: dict[str, Any], as_json: bool) -> None:
         if isinstance(value, dict):
             for key, entry in value.items():
                 text = f"{entry['count']} × {', '.join(entry['properties'])}" if isinstance(entry, dict) else entry
-                print(f"{name.ljust(width)}  {key}: {text}")
+                print(f"{name.ljust(width)}  {_printable(key)}: {_printable(str(text))}")
         elif isinstance(value, list) and value and isinstance(value[0], str):
-            print(f"{name.ljust(width)}  " + ("\n" + " " * (width + 2)).join(value))
+            print(f"{name.ljust(width)}  " + ("\n" + " " * (width + 2)).join(map(_printable, value)))
         else:
             print(f"{name.ljust(width)}  {value}")
+
+
+def _printable(text: str) -> str:
+    """Text out of a file, which must not talk to the terminal."""
+    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text)
 
 
 def _told(error: BaseException) -> str:

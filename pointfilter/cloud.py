@@ -34,9 +34,11 @@ class PointCloud:
     source: Source | None = None
 
     def __post_init__(self) -> None:
-        if self.xyz.ndim != 2 or self.xyz.shape[1] != 3:
-            raise ValueError(f"xyz must have shape (n, 3), got {self.xyz.shape}")
-        self.xyz.setflags(write=False)
+        xyz = np.asarray(self.xyz, dtype=np.float64).view()  # a view: the caller may go on writing to the array itself
+        if xyz.ndim != 2 or xyz.shape[1] != 3:
+            raise ValueError(f"xyz must have shape (n, 3), got {xyz.shape}")
+        xyz.setflags(write=False)
+        object.__setattr__(self, "xyz", xyz)
 
     def __len__(self) -> int:
         return len(self.xyz)

@@ -43,8 +43,6 @@ class Engine:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
-        # The arena keeps the largest batch for ever; batches are alike, so it gains nothing here.
-        options.enable_cpu_mem_arena = False
         options.log_severity_level = 3
         try:
             self._session = onnxruntime.InferenceSession(bundle.onnx, options, providers=[provider])
@@ -69,7 +67,10 @@ class Engine:
         """One real inference; raises InvalidModelError when the answer is not what the bundle promises."""
         generator = np.random.default_rng(0)
         patches = generator.uniform(-1, 1, (2, self.bundle.patch_points, 3)).astype(np.float32)
-        answer = self(patches)
+        try:
+            answer = self(patches)
+        except Exception as error:
+            raise InvalidModelError(f"model {self.bundle.name!r} takes no patches: {_first_line(error)}") from error
         if answer.shape != (2, 3) or not np.isfinite(answer).all():
             raise InvalidModelError(f"model {self.bundle.name!r} answered a test patch with shape {answer.shape}")
 

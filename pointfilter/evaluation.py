@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pointfilter.cloud import PointCloud
-from pointfilter.errors import InputError, MalformedFileError
+from pointfilter.errors import DegenerateCloudError, InputError, MalformedFileError
 from pointfilter.metrics import (
     chamfer_distance,
     mean_neighbour_distance,
@@ -18,6 +18,7 @@ from pointfilter.metrics import (
     normalised,
     point_to_surface,
 )
+from pointfilter.noise import bounding_box_diagonal
 
 Float64 = NDArray[np.float64]
 
@@ -33,6 +34,8 @@ def evaluate(cloud: PointCloud, clean: PointCloud, mesh: Path | None = None) -> 
     for name, one in (("clean", clean), ("filtered", cloud)):
         if one.finite.sum() < PLANE_NEIGHBOURS:
             raise InputError(f"the {name} cloud has fewer than {PLANE_NEIGHBOURS} finite points")
+    if not 0 < bounding_box_diagonal(clean.xyz[clean.finite]) < np.inf:
+        raise DegenerateCloudError("the clean cloud has no extent, or none within double precision, to scale by")
     vertices, faces = read_mesh(mesh) if mesh is not None else (np.empty((0, 3)), None)
     clean_points, points, vertices = normalised(clean.xyz[clean.finite], cloud.xyz[cloud.finite], vertices)
     if faces is not None:
@@ -76,8 +79,10 @@ def read_mesh(path: Path) -> tuple[Float64, NDArray[np.int64]]:
         lists = face[next(name for name in ("vertex_indices", "vertex_index") if name in face)]
         faces = [(row[0], row[k], row[k + 1]) for row in lists for k in range(1, len(row) - 1)]
         triangles = np.array(faces, dtype=np.int64).reshape(-1, 3)
-    except (KeyError, StopIteration, plyfile.PlyParseError, ValueError) as error:
+    except (KeyError, StopIteration, TypeError, plyfile.PlyParseError, ValueError, OverflowError) as error:
         raise MalformedFileError(f"{path} has no readable faces: {error}") from error
+    if not cloud.finite.all():
+        raise MalformedFileError(f"{path} has corners that are not finite")
     if len(triangles) == 0 or triangles.min() < 0 or triangles.max() >= len(cloud):
         raise MalformedFileError(f"{path} has no faces, or faces of vertices that it does not have")
     return cloud.xyz, triangles

@@ -28,9 +28,7 @@ DEFAULT_RADIUS = 0.05  # of the bounding-box diagonal (§3.2)
 DEFAULT_ITERATIONS = 2
 MAX_ITERATIONS = 100
 MIN_NEIGHBOURS = 4  # fewer, the centre included, say nothing about a surface: the point stays where it is
-ROWS_PER_BATCH = (
-    32_768  # points a batch, all patches together: large enough for the products, small enough for the cache
-)
+ROWS_PER_BATCH = 2_048  # points a batch, all its patches together; measured: docs/adr/0005-one-thread-a-call.md
 
 
 CENTRES_PER_COUNT = 1024  # centres whose neighbours are counted between two looks at `cancelled`

@@ -18,7 +18,8 @@ MSE_NEIGHBOURS = 10  # M in Eq. 9
 
 def normalised(clean: Float64, *others: Float64) -> tuple[Float64, ...]:
     """All clouds, (n, 3) each, moved and scaled by the one transformation that gives `clean` a diagonal of 1."""
-    centre = (clean.min(axis=0) + clean.max(axis=0)) / 2
+    low, high = clean.min(axis=0), clean.max(axis=0)
+    centre = low + (high - low) / 2
     diagonal = bounding_box_diagonal(clean)
     return tuple((points - centre) / diagonal for points in (clean, *others))
 
@@ -51,8 +52,8 @@ def point_to_surface(points: Float64, vertices: Float64, faces: NDArray[np.int64
 def closest_on_surface(points: Float64, vertices: Float64, faces: NDArray[np.int64]) -> Float64:
     """The nearest place on a triangle mesh to each point: (n, 3), (v, 3), (f, 3) -> (n, 3) float64.
 
-    Candidates come from trees over the triangles' centres, one tree a size of triangle, so that a few large triangles do
-    not widen the search among the small ones; the nearest place itself is exact.
+    Candidates come from trees over the triangles' centres, one tree a size of triangle, so that a few large triangles
+    do not widen the search among the small ones; the nearest place itself is exact.
     """
     corners = vertices[faces]
     centres = corners.mean(axis=1)

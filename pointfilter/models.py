@@ -24,6 +24,7 @@ _FIELDS: dict[str, type | tuple[type, ...]] = {
     "schema": int, "name": str, "version": str, "sha256": str, "opset": int, "frame": str, "patch_points": int,
     "radius": float, "iterations": int, "parameters": int, "network": dict, "training": dict, "scores": dict,
 }  # fmt: skip
+_RANGES = {"patch_points": (1, 2**16), "radius": (1e-9, 1.0), "iterations": (1, 100)}
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,11 @@ def load_bundle(folder: Path) -> ModelBundle:
     for name, kind in _FIELDS.items():
         if not isinstance(described.get(name), kind):
             raise InvalidModelError(f"model.json of {folder.name!r}: {name!r} is missing or of the wrong type")
+    for name, (low, high) in _RANGES.items():
+        if not low <= described[name] <= high:
+            raise InvalidModelError(
+                f"model.json of {folder.name!r}: {name!r} must be from {low} to {high}, not {described[name]}"
+            )
     if described["frame"] != FRAME:
         raise InvalidModelError(f"model {folder.name!r} was trained with frames {described['frame']!r}, not {FRAME!r}")
     if described["sha256"] != digest:

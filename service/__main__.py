@@ -1,7 +1,7 @@
 """`python -m service`: one process, settings from the environment (docs/configuration.md).
 
 Exit codes: 0 after SIGTERM or Ctrl-C once the running requests are done; 1 when the default model cannot be used;
-2 for settings that make no sense.
+2 for settings that make no sense; 3 when the address cannot be listened on.
 """
 
 from __future__ import annotations

@@ -10,6 +10,8 @@ from urllib.parse import quote
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
+from service.exchange import exchange_of
+
 CHUNK_BYTES = 1 << 18
 MAX_STEM = 100
 NO_NAME = "cloud"
@@ -47,11 +49,17 @@ class FileDownload(Response):
         self._seconds = seconds
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:  # noqa: ARG002 - ASGI's signature
-        async with asyncio.timeout(self._seconds):
-            await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
-            with self._path.open("rb") as file:
-                more = True
-                while more:
-                    chunk = await asyncio.to_thread(file.read, CHUNK_BYTES)
-                    more = bool(chunk)
-                    await send({"type": "http.response.body", "body": chunk, "more_body": more})
+        try:
+            async with asyncio.timeout(self._seconds):
+                await self._stream(send)
+        except TimeoutError:
+            exchange_of(scope).code = "slow-transfer"  # an answer without its end: the server cuts the connection
+
+    async def _stream(self, send: Send) -> None:
+        await send({"type": "http.response.start", "status": self.status_code, "headers": self.raw_headers})
+        with self._path.open("rb") as file:
+            more = True
+            while more:
+                chunk = await asyncio.to_thread(file.read, CHUNK_BYTES)
+                more = bool(chunk)
+                await send({"type": "http.response.body", "body": chunk, "more_body": more})

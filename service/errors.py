@@ -4,7 +4,7 @@ PointfilterError
 └── ServiceError
     ├── MalformedRequestError     malformed-request      the HTTP body is not one file
     ├── UnsupportedCodingError    unsupported-coding     Content-Encoding of the request
-    ├── SlowUploadError           slow-upload            the body did not arrive in time
+    ├── SlowTransferError         slow-transfer          the body did not arrive in time
     ├── QueueFullError            queue-full             more requests than places
     ├── NotReadyError             not-ready              the default model has not answered yet
     ├── DrainingError             draining               the process is about to end
@@ -42,8 +42,8 @@ class UnsupportedCodingError(ServiceError):
     code = "unsupported-coding"
 
 
-class SlowUploadError(ServiceError):
-    code = "slow-upload"
+class SlowTransferError(ServiceError):
+    code = "slow-transfer"
 
 
 class QueueFullError(ServiceError):

@@ -69,7 +69,7 @@ class ExchangeMiddleware:
         body = _Body(scope, receive)
         head = scope["method"] == "HEAD"
         if head:
-            scope["method"] = "GET"  # every page that can be fetched can be asked about
+            scope = {**scope, "method": "GET"}  # every page that can be fetched can be asked about
 
         async def answer(message: Message) -> None:
             if message["type"] == "http.response.start":

@@ -64,9 +64,10 @@ TYPES: dict[str, ProblemType] = {
         "The address exists and does not take this HTTP method.",
         "The Allow header lists the methods it takes.",
     ),
-    "slow-upload": ProblemType(
-        408, "The upload took too long", "timeout",
-        "The file did not arrive within the time the service gives an upload.",
+    "slow-transfer": ProblemType(
+        408, "The transfer took too long", "timeout",
+        "The file did not arrive within the time the service gives an upload. A result not fetched in that time is "
+        "cut off, too; the log and the metrics count it here.",
         "Try a faster connection or a smaller file, or raise POINTFILTER_TRANSFER_SECONDS.",
     ),
     "limit-exceeded": ProblemType(
@@ -199,7 +200,7 @@ def problem_response(
         title=kind.title,
         status=kind.status,
         detail=told.message if told else kind.meaning,
-        instance=f"{quote(request.url.path[:200])}#{exchange.request_id}",
+        instance=f"{quote(request.scope['path'][:200])}#{exchange.request_id}",
         code=code,
         limit=_shown(told.limit) if told else None,
         actual=_shown(told.actual) if told else None,

@@ -69,12 +69,12 @@ class Settings(BaseSettings):
     transfer_seconds: Annotated[float, Field(gt=0)] = 600.0
     """Longest time a client may take to send its file (408), and again to fetch the result (the connection is cut)."""
 
-    drain_seconds: Annotated[int, Field(ge=0)] = 60
+    drain_seconds: Annotated[int, Field(ge=0)] = 30
     """After SIGTERM, how long running requests may take to finish before they are stopped."""
 
     temp_dir: Path | None = None
-    """Folder for uploads and results while a request lasts; by default the system's. Needs room for every place in the
-    house: (workers + queue_size) x 2 x max_upload_bytes at the very most."""
+    """Folder for uploads and results while a request lasts; by default the system's. Leave room for workers +
+    queue_size uploads of the largest size and their results."""
 
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """Least severe messages that are logged."""

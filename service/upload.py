@@ -11,7 +11,7 @@ from typing import BinaryIO
 from starlette.requests import ClientDisconnect, Request
 
 from pointfilter.errors import LimitExceededError
-from service.errors import ClientGoneError, MalformedRequestError, SlowUploadError, UnsupportedCodingError
+from service.errors import ClientGoneError, MalformedRequestError, SlowTransferError, UnsupportedCodingError
 from service.multipart import MAX_OVERHEAD_BYTES, FilePart
 from service.settings import Settings, variable
 
@@ -31,7 +31,7 @@ async def receive_upload(request: Request, path: Path, settings: Settings) -> Up
     """Writes the raw body, or the part `file` of a multipart form, to a new private file at `path`.
 
     Raises LimitExceededError (before reading where the client declares the size), UnsupportedCodingError,
-    MalformedRequestError, SlowUploadError, ClientGoneError, OSError.
+    MalformedRequestError, SlowTransferError, ClientGoneError, OSError.
     """
     if request.headers.get("content-encoding", "identity").strip().lower() not in ("identity", ""):
         raise UnsupportedCodingError("the request has a Content-Encoding")
@@ -47,7 +47,7 @@ async def receive_upload(request: Request, path: Path, settings: Settings) -> Up
             with _private(path) as file:
                 size = await _copy(request, file, part, settings, overhead)
     except TimeoutError:
-        raise SlowUploadError(
+        raise SlowTransferError(
             f"the file did not arrive within {settings.transfer_seconds:g} s",
             limit=settings.transfer_seconds,
             hint=f"whoever runs the service can raise {variable('transfer_seconds')}",
@@ -90,4 +90,4 @@ def too_large(settings: Settings, actual: int | None) -> LimitExceededError:
 
 
 def _private(path: Path) -> BinaryIO:
-    return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb", buffering=0)
+    return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import hashlib
 import time
 from collections.abc import AsyncIterator, Callable
@@ -82,7 +83,8 @@ async def in_worker(executor: Executor, work: Callable[[Event], T]) -> T:
     """Runs work(stop) in a thread. Cancelling the waiting task sets `stop`, and the cancellation goes on only when the
     thread has ended: whoever catches it may free the worker and remove the files."""
     stop = Event()
-    future = asyncio.get_running_loop().run_in_executor(executor, work, stop)
+    context = contextvars.copy_context()  # what the thread logs carries the request's id
+    future = asyncio.get_running_loop().run_in_executor(executor, context.run, work, stop)
     try:
         return await asyncio.shield(future)
     except asyncio.CancelledError:

@@ -1,12 +1,13 @@
 """Train a Pointfilter network.
 
-    python -m training --out runs/mine                      # the default preset, on procedural shapes
-    python -m training --out runs/mine --resume             # after a kill, a reboot, a night
-    python -m training --out runs/try --preset smoke        # the whole chain in minutes
+    python -m training                                      # the default preset, on procedural shapes
+    python -m training --resume                             # after a kill, a reboot, a night
+    python -m training --preset smoke                       # the whole chain in minutes
     python -m training --out runs/mine --meshes my_scans/   # your own ply, obj, off, stl
     python -m training --out runs/mine --set data.noise_high=0.01 --set steps=20000
 
-The folder then holds checkpoint.pt (for `python -m export`), log.csv (the curve) and settings.json.
+The folder (runs/PRESET unless --out says another) then holds checkpoint.pt (for `python -m export`), log.csv (the
+curve) and settings.json.
 """
 
 from __future__ import annotations
@@ -27,9 +28,7 @@ def parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m training", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--out", type=Path, default=Path("runs/default"), help="folder of the run (default: %(default)s)"
-    )
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the run (default: runs/PRESET)")
     parser.add_argument("--preset", choices=preset_names(), default="default", help="default: %(default)s")
     parser.add_argument("--resume", action="store_true", help="go on from the folder's checkpoint, exactly")
     parser.add_argument("--init", type=Path, help="start from the weights of this checkpoint.pt")
@@ -61,16 +60,17 @@ def main(arguments: list[str] | None = None) -> int:
     from training.presets import load_preset
     from training.train import start
 
+    folder = options.out or Path("runs", options.preset)
     overrides = list(options.set)
     if options.seed is not None:
         overrides += [f"seed={options.seed}", f"data.seed={options.seed}"]
     try:
-        if options.resume and not (options.out / "checkpoint.pt").is_file():
-            raise FileNotFoundError(f"--resume: no checkpoint.pt in {options.out}")
+        if options.resume and not (folder / "checkpoint.pt").is_file():
+            raise FileNotFoundError(f"--resume: no checkpoint.pt in {folder}")
         settings = load_preset(options.preset, overrides)
         init = torch.load(options.init, weights_only=True)["network"] if options.init else None
         run = start(
-            options.out,
+            folder,
             settings,
             resume=options.resume,
             meshes=options.meshes,
@@ -82,9 +82,9 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"stopped; go on with --out {options.out} --resume", file=sys.stderr)
+        print(f"stopped; go on with --out {folder} --resume", file=sys.stderr)
         return 130
-    print(f"{run.step} steps, {run.seconds / 3600:.2f} h: {options.out / 'checkpoint.pt'}")
+    print(f"{run.step} steps, {run.seconds / 3600:.2f} h: {folder / 'checkpoint.pt'}")
     return 0
 
 

@@ -363,14 +363,15 @@ def _write_new(cloud: PointCloud, file: BinaryIO, comment: str | None) -> None:
 def _convert(path: Path, encoding: str) -> None:
     """Rewrites our own, already checked file in another encoding; plyfile reads and writes it."""
     try:
-        data = plyfile.PlyData.read(str(path), mmap=False)
+        with np.errstate(all="ignore"):  # text beyond its type is infinite, here as in _read_ascii
+            data = plyfile.PlyData.read(str(path), mmap=False)
         if encoding == "binary_big_endian" and any(_mixes_lists(element) for element in data):
             # plyfile 1.1 writes the numbers of such rows in the machine's own byte order.
             raise ParameterError("rows that hold both lists and numbers cannot be converted to binary_big_endian")
         data.text = encoding == "ascii"
         data.byte_order = ENCODINGS[encoding]
         data.write(str(path))
-    except (plyfile.PlyParseError, ValueError, UnicodeError) as error:
+    except (plyfile.PlyParseError, ValueError, OverflowError) as error:
         raise MalformedFileError(f"the file cannot be converted to {encoding}: {error}") from error
 
 

@@ -91,12 +91,11 @@ def read_header(file: BinaryIO, file_size: int, limits: ReadLimits) -> Header:
     if ending not in (b"\n", b"\r\n"):
         raise MalformedFileError("line 1: 'ply' must be followed by a line break")
     parser = _Parser()
-    raw = first
-    number = 1
+    lines = [first]
+    left = limits.max_header_bytes - len(first)
     while True:
-        left = limits.max_header_bytes - len(raw)
         line = file.readline(left + 1)
-        number += 1
+        number = len(lines) + 1
         if len(line) > left:
             raise LimitExceededError(
                 f"the header is longer than {limits.max_header_bytes} bytes",
@@ -105,10 +104,14 @@ def read_header(file: BinaryIO, file_size: int, limits: ReadLimits) -> Header:
             )
         if not line.endswith(b"\n"):
             raise MalformedFileError(f"line {number}: the file ends inside the header")
-        if line.strip() == b"end_header":
+        text = line.strip()
+        if text == b"end_header":
             break
-        raw += line
-        parser.line(number, line)
+        lines.append(line)
+        left -= len(line)
+        if text:
+            parser.line(number, text)
+    raw = b"".join(lines)
     header = parser.finish(raw, ending, raw_size=len(raw) + len(line))
     _check(header, file_size, limits)
     return header
@@ -117,26 +120,26 @@ def read_header(file: BinaryIO, file_size: int, limits: ReadLimits) -> Header:
 class _Parser:
     def __init__(self) -> None:
         self.encoding = ""
-        self.elements: list[tuple[str, int, list[Property]]] = []
+        self.elements: dict[str, tuple[int, dict[str, Property]]] = {}
+        self.properties: dict[str, Property] = {}  # of the last element
         self.comments: list[str] = []
         self.obj_info: list[str] = []
 
-    def line(self, number: int, line: bytes) -> None:
-        text = _decoded(line).strip()
-        keyword, *others = text.split(None, 1) or [""]
-        rest = others[0] if others else ""
-        if keyword == "comment":
-            self.comments.append(rest)
-        elif keyword == "obj_info":
-            self.obj_info.append(rest)
-        elif keyword == "format":
-            self._format(number, rest.split())
-        elif keyword == "element":
-            self._element(number, rest.split())
-        elif keyword == "property":
-            self._property(number, rest.split())
-        elif text:
-            raise MalformedFileError(f"line {number}: {shown(text)} is no PLY header line")
+    def line(self, number: int, text: bytes) -> None:
+        keyword, *others = text.split(None, 1)
+        rest = others[0] if others else b""
+        if keyword == b"comment":
+            self.comments.append(_decoded(rest))
+        elif keyword == b"obj_info":
+            self.obj_info.append(_decoded(rest))
+        elif keyword == b"format":
+            self._format(number, _words(rest))
+        elif keyword == b"element":
+            self._element(number, _words(rest))
+        elif keyword == b"property":
+            self._property(number, _words(rest))
+        else:
+            raise MalformedFileError(f"line {number}: {shown(_decoded(text))} is no PLY header line")
 
     def _format(self, number: int, words: list[str]) -> None:
         if self.encoding:
@@ -155,9 +158,10 @@ class _Parser:
             raise MalformedFileError(
                 f"line {number}: an element needs a name and a count, not {shown(' '.join(words))}"
             )
-        if any(words[0] == name for name, _, _ in self.elements):
+        if words[0] in self.elements:
             raise MalformedFileError(f"line {number}: a second element {shown(words[0])}")
-        self.elements.append((words[0], int(words[1]), []))
+        self.properties = {}
+        self.elements[words[0]] = (int(words[1]), self.properties)
 
     def _property(self, number: int, words: list[str]) -> None:
         if not self.elements:
@@ -168,15 +172,16 @@ class _Parser:
             raise MalformedFileError(f"line {number}: {shown(' '.join(words))} is no property")
         if is_list and TYPES[types[0]].startswith("f"):
             raise MalformedFileError(f"line {number}: the length of a list must be an integer type, not {types[0]}")
-        properties = self.elements[-1][2]
-        if any(property.name == words[-1] for property in properties):
+        if words[-1] in self.properties:
             raise MalformedFileError(f"line {number}: a second property {shown(words[-1])} in one element")
-        properties.append(Property(words[-1], types[-1], types[0] if is_list else None))
+        self.properties[words[-1]] = Property(words[-1], types[-1], types[0] if is_list else None)
 
     def finish(self, raw: bytes, ending: bytes, raw_size: int) -> Header:
         if not self.encoding:
             raise MalformedFileError("the header has no format line")
-        elements = tuple(Element(name, count, tuple(properties)) for name, count, properties in self.elements)
+        elements = tuple(
+            Element(name, count, tuple(properties.values())) for name, (count, properties) in self.elements.items()
+        )
         return Header(self.encoding, elements, tuple(self.comments), tuple(self.obj_info), raw, ending, raw_size)
 
 
@@ -206,12 +211,16 @@ def _check(header: Header, file_size: int, limits: ReadLimits) -> None:
         )
 
 
-def _decoded(line: bytes) -> str:
-    """Comments may be in any encoding: UTF-8 where it is, else Latin-1, which never fails. `raw` keeps the bytes."""
+def _decoded(text: bytes) -> str:
+    """Headers come in any encoding: UTF-8 where it is, else Latin-1, which never fails. `raw` keeps the bytes."""
     try:
-        return line.decode()
+        return text.decode()
     except UnicodeDecodeError:
-        return line.decode("latin-1")
+        return text.decode("latin-1")
+
+
+def _words(text: bytes) -> list[str]:
+    return [_decoded(word) for word in text.split()]  # of bytes: only ASCII knows which characters are blanks
 
 
 def shown(text: str) -> str:

@@ -39,7 +39,7 @@ _ANSWERS: dict[int | str, dict[str, Any]] = {
         "headers": {name: {"description": text, "schema": {"type": "string"}} for name, text in _HEADERS.items()},
     },
     **answers(
-        "malformed-request", "malformed-file", "invalid-input", "model-not-found", "slow-upload", "limit-exceeded",
+        "malformed-request", "malformed-file", "invalid-input", "model-not-found", "slow-transfer", "limit-exceeded",
         "unsupported-format", "unsupported-coding", "missing-coordinates", "too-few-points", "degenerate-cloud",
         "parameter-out-of-range", "queue-full", "client-closed", "cancelled", "internal-error", "error", "model-error",
         "invalid-model", "not-ready", "draining", "provider-unavailable", "storage-full", "deadline-exceeded",
@@ -64,7 +64,7 @@ _BODY = {
     summary="Filter a point cloud",
     tags=["filter"],
     dependencies=[Ready],
-    response_class=FileDownload,
+    response_class=Response,
     responses=_ANSWERS,
     openapi_extra=_BODY,
 )

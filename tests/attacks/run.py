@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import resource
+import signal
 import sys
 import time
 from pathlib import Path
@@ -17,6 +18,8 @@ import numpy as np
 from pointfilter import PointCloud, filter_cloud
 from tests.attacks.files import ATTACKS
 from tests.clouds import pooled
+
+SECONDS = 10  # after so many an attack has won
 
 MEMORY = 256 << 20  # bytes that the process may grow by; the largest file that is read whole has 20 MB
 
@@ -30,14 +33,20 @@ class FakeEngine:
         return pooled(patches)
 
 
+def give_up(*_: object) -> None:
+    raise TimeoutError(f"still running after {SECONDS} s")
+
+
 def main(folder: Path) -> None:
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     results = {}
+    signal.signal(signal.SIGALRM, give_up)
     for attack in ATTACKS:
         path, target = folder / "attack.ply", folder / "result.ply"
         attack.write(path)
         # Files are mapped, so what a file itself takes is not counted.
         resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY + path.stat().st_size, resource.RLIM_INFINITY))
+        signal.alarm(SECONDS)
         started = time.perf_counter()
         error: BaseException | None = None
         try:
@@ -45,6 +54,7 @@ def main(folder: Path) -> None:
         except Exception as caught:  # noqa: BLE001 - which one it is, is the question
             error = caught
         seconds = time.perf_counter() - started
+        signal.alarm(0)
         resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         results[attack.name] = {
             "error": type(error).__name__ if error else None,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,15 +12,13 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
-from fastapi import FastAPI
 from starlette.testclient import TestClient
 
 import service.work
 from pointfilter import PointCloud
-from pointfilter.errors import FilteringCancelledError
 from service.app import create_app
-from service.house import House
 from service.settings import Settings
+from tests.service.apps import Gate, until
 
 PATCH_POINTS = 32
 
@@ -111,47 +107,9 @@ def ply(cloud: PointCloud, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-class Gate:
-    """Stands in for filter_cloud: requests stay inside until the gate opens or their work is stopped."""
-
-    def __init__(self) -> None:
-        self.open = threading.Event()
-        self.entered = 0
-        self.stopped = 0
-        self._real = service.work.filter_cloud
-
-    def __call__(self, cloud: PointCloud, engine: Any, *, cancelled: Callable[[], bool], **others: Any) -> Any:
-        self.entered += 1
-        while not self.open.wait(0.01):
-            if cancelled():
-                self.stopped += 1
-                raise FilteringCancelledError("stopped")
-        return self._real(cloud, engine, cancelled=cancelled, **others)
-
-
 @pytest.fixture
 def gate(monkeypatch: pytest.MonkeyPatch) -> Iterator[Gate]:
     gate = Gate()
     monkeypatch.setattr(service.work, "filter_cloud", gate)
     yield gate
     gate.open.set()
-
-
-def until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
-    """Waits for a condition; fails when it does not come true."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.01)
-
-
-def house_of(client: TestClient) -> House:
-    assert isinstance(client.app, FastAPI)
-    house = client.app.state.house
-    assert isinstance(house, House)
-    return house
-
-
-def metric(client: TestClient, name: str, **labels: str) -> float:
-    """A sample's value; 0 for one that is not there yet."""
-    return house_of(client).telemetry.registry.get_sample_value(name, labels) or 0.0

@@ -1,0 +1,166 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from export import __main__ as command
+from export import bundle as bundle_module
+from export.bundle import ParityError, write_bundle
+from export.checkpoint import Loaded, load_checkpoint
+from pointfilter import Engine, load_bundle
+from training.network import NetworkSettings, Pointfilter
+from training.presets import load_preset
+from training.train import Run
+
+
+def loaded(seed: int = 0) -> Loaded:
+    torch.manual_seed(seed)
+    network = Pointfilter(NetworkSettings((8, 16), (8,), norm_after_pool=True)).eval()
+    return Loaded(network, patch_points=32, radius=0.07, training={"steps": 5})
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    """What a run leaves behind, before its first step."""
+    settings = load_preset("smoke", ["network.encoder=[8, 16]", "network.decoder=[8]", "steps=10"])
+    run = Run(tmp_path / "run", settings, resume=False)
+    run.save()
+    return tmp_path / "run" / "checkpoint.pt"
+
+
+def test_a_bundle_says_where_it_comes_from(tmp_path: Path) -> None:
+    source = loaded()
+    bundle, error = write_bundle(source, tmp_path / "deep" / "mine", "1.2", iterations=3, scores={"cd": 1.0})
+    assert error <= bundle_module.PARITY_TOLERANCE
+    assert bundle == load_bundle(tmp_path / "deep" / "mine")
+    assert (bundle.name, bundle.version, bundle.iterations) == ("mine", "1.2", 3)
+    assert (bundle.patch_points, bundle.radius) == (32, 0.07)
+    assert (bundle.training, bundle.scores) == ({"steps": 5}, {"cd": 1.0})
+    assert bundle.network == {"encoder": [8, 16], "decoder": [8], "norm_after_pool": True}
+    assert bundle.parameters == sum(parameter.numel() for parameter in source.network.parameters())
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["mine"]
+    Engine(bundle, "cpu").warm_up()
+
+
+def test_a_parity_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    other = bundle_module.build(loaded(seed=1).network)
+    monkeypatch.setattr(bundle_module, "build", lambda network: other)
+    with pytest.raises(ParityError, match="differ by"):
+        write_bundle(loaded(), tmp_path / "mine", "1")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_parity_failure_leaves_the_old_bundle_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    old, _ = write_bundle(loaded(), tmp_path / "mine", "1")
+    monkeypatch.setattr(bundle_module, "parity_error", lambda *_: float("nan"))
+    with pytest.raises(ParityError):
+        write_bundle(loaded(seed=1), tmp_path / "mine", "2")
+    assert load_bundle(tmp_path / "mine") == old
+
+
+def test_a_bundle_can_be_replaced(tmp_path: Path) -> None:
+    write_bundle(loaded(), tmp_path / "mine", "1")
+    new, _ = write_bundle(loaded(seed=1), tmp_path / "mine", "2")
+    assert load_bundle(tmp_path / "mine") == new
+    assert new.version == "2"
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+@pytest.mark.parametrize("step", range(3))
+def test_a_replacement_that_fails_leaves_the_old_bundle(step: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whichever rename fails."""
+    old, _ = write_bundle(loaded(), tmp_path / "mine", "1")
+    real, calls = Path.replace, []
+
+    def replace(self: Path, target: Path) -> Path:
+        calls.append(target)
+        if len(calls) == step + 1:
+            raise OSError(5, "Input/output error")
+        return real(self, target)
+
+    monkeypatch.setattr(Path, "replace", replace)
+    try:
+        write_bundle(loaded(seed=1), tmp_path / "mine", "2")
+    except OSError:
+        assert load_bundle(tmp_path / "mine") == old
+    else:
+        assert step >= len(calls)
+        assert load_bundle(tmp_path / "mine").version == "2"
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_a_folder_that_is_no_bundle_is_not_overwritten(tmp_path: Path) -> None:
+    """`--out bundles` for `--out bundles/mine` must not cost all the bundles in it."""
+    write_bundle(loaded(), tmp_path / "bundles" / "mine", "1")
+    (tmp_path / "diary").mkdir()
+    (tmp_path / "diary" / "dear.txt").write_text("dear")
+    (tmp_path / "file").write_text("")
+    for name in ("bundles", "diary", "file"):
+        with pytest.raises(ValueError, match=name):
+            write_bundle(loaded(seed=1), tmp_path / name, "2")
+    assert load_bundle(tmp_path / "bundles" / "mine").version == "1"
+    assert (tmp_path / "diary" / "dear.txt").read_text() == "dear"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bundles", "diary", "file"]
+
+
+@pytest.mark.parametrize("iterations", [0, -1, 101])
+def test_iterations_out_of_range_write_nothing(iterations: int, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="iterations"):
+        write_bundle(loaded(), tmp_path / "mine", "1", iterations=iterations)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- the command ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_exports_a_run(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "scores.json").write_text('{"cd": 0.8}')
+    out = tmp_path / "out" / "mine"
+    arguments = [str(checkpoint), "--out", str(out), "--version", "7", "--scores", str(tmp_path / "scores.json")]
+    assert command.main(arguments) == 0
+    bundle = load_bundle(out)
+    assert (bundle.version, bundle.iterations, bundle.scores) == ("7", 2, {"cd": 0.8})
+    assert bundle.training["settings"]["network"]["encoder"] == [8, 16]
+    assert bundle.training["steps"] == 0
+    assert f"{bundle.parameters} parameters" in capsys.readouterr().out
+
+
+def test_the_average_is_exported_and_not_the_last_weights(checkpoint: Path) -> None:
+    state = torch.load(checkpoint, weights_only=True)
+    for value in state["network"].values():
+        value.zero_()
+    torch.save(state, checkpoint)
+    patches = torch.randn(2, 9, 3)
+    averaged = load_checkpoint(checkpoint).network(patches)
+    assert averaged.abs().max() > 0
+    state["settings"]["ema_decay"] = 0.0
+    torch.save(state, checkpoint)
+    np.testing.assert_array_equal(load_checkpoint(checkpoint).network(patches).detach(), 0)
+
+
+@pytest.mark.parametrize("arguments", [["missing.pt"], ["garbage.pt"], ["good", "--iterations", "0"], ["good", "--scores", "garbage.pt"],
+                                       ["good", "--scores", "missing.json"]])  # fmt: skip
+def test_the_command_says_what_is_wrong(
+    arguments: list[str], checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("garbage.pt").write_bytes(b"garbage")
+    arguments = [str(checkpoint) if argument == "good" else argument for argument in arguments]
+    assert command.main([*arguments, "--out", "out/mine"]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1
+    assert not Path("out").exists()
+
+
+def test_model_json_holds_no_numbers_that_json_has_not(tmp_path: Path) -> None:
+    write_bundle(loaded(), tmp_path / "mine", "1")
+
+    def refuse(name: str) -> None:
+        raise AssertionError(name)
+
+    json.loads((tmp_path / "mine" / "model.json").read_text(), parse_constant=refuse)

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+from export.bundle import PARITY_TOLERANCE, parity_error
+from export.checkpoint import Loaded
+from export.graph import OPSET, build
+from training.network import NetworkSettings, Pointfilter
+
+
+def network(norm_after_pool: bool, seed: int = 0) -> Pointfilter:
+    """Random weights, running statistics off their defaults, and BatchNorm scales of both signs and near zero."""
+    torch.manual_seed(seed)
+    made = Pointfilter(NetworkSettings((16, 24, 40), (24, 12), norm_after_pool))
+    with torch.no_grad():
+        for norm in [*made.encoder_norms, *made.decoder_norms]:
+            norm.weight.normal_()
+            norm.weight[0], norm.weight[1] = 0.0, -1e-3
+            norm.bias.normal_()
+            norm.running_mean.normal_()
+            norm.running_var.uniform_(0.2, 3.0)
+    return made.eval()
+
+
+def answers(model: onnx.ModelProto, patches: np.ndarray) -> np.ndarray:
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    (answer,) = session.run(None, {"patches": patches})
+    return np.asarray(answer)
+
+
+@pytest.mark.parametrize("norm_after_pool", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_onnxruntime_answers_what_torch_answers(norm_after_pool: bool, seed: int) -> None:
+    made = network(norm_after_pool, seed)
+    assert (made.encoder_norms[-1].weight < 0).any()
+    model = build(made)
+    rng = np.random.default_rng(seed)
+    for batch, length in [(1, 1), (2, 7), (64, 33), (3, 700)]:
+        patches = rng.uniform(-1, 1, (batch, length, 3)).astype(np.float32)
+        with torch.inference_mode():
+            expected = made(torch.from_numpy(patches)).numpy()
+        assert np.abs(expected).max() > 0.05
+        np.testing.assert_allclose(answers(model, patches), expected, rtol=0, atol=PARITY_TOLERANCE)
+
+
+@pytest.mark.parametrize("norm_after_pool", [False, True])
+def test_the_graph_is_valid_folded_and_dynamic(norm_after_pool: bool) -> None:
+    model = build(network(norm_after_pool))
+    onnx.checker.check_model(model, full_check=True)
+    operators = [node.op_type for node in model.graph.node]
+    assert "BatchNormalization" not in operators
+    assert operators.count("Gemm") == 3 + 2 + 1
+    assert operators[-1] == "Tanh"
+    assert model.opset_import[0].version == OPSET
+    (entry,), (exit_,) = model.graph.input, model.graph.output
+    sizes = [dimension.dim_param or dimension.dim_value for dimension in entry.type.tensor_type.shape.dim]
+    assert sizes[2] == 3
+    assert all(isinstance(size, str) for size in sizes[:2])
+    assert exit_.type.tensor_type.shape.dim[1].dim_value == 3
+    for weight in model.graph.initializer:
+        assert np.isfinite(onnx.numpy_helper.to_array(weight)).all()
+
+
+def test_scales_stay_behind_the_max_only_where_they_must() -> None:
+    made = network(norm_after_pool=True)
+    with torch.no_grad():
+        made.encoder_norms[-1].weight.abs_()
+    assert "Mul" not in [node.op_type for node in build(made).graph.node]
+    assert "Mul" in [node.op_type for node in build(network(norm_after_pool=True)).graph.node]
+
+
+def test_padding_and_order_change_nothing_in_the_exported_network() -> None:
+    model = build(network(norm_after_pool=False))
+    patches = np.random.default_rng(0).uniform(-1, 1, (4, 30, 3)).astype(np.float32)
+    patches[:, 0] = 0
+    padded = np.concatenate([patches, np.zeros((4, 90, 3), np.float32)], axis=1)
+    np.testing.assert_allclose(answers(model, padded), answers(model, patches), atol=1e-6)
+    np.testing.assert_allclose(answers(model, patches[:, ::-1].copy()), answers(model, patches), atol=1e-6)
+
+
+def test_the_parity_check_sees_one_wrong_weight() -> None:
+    loaded = Loaded(network(norm_after_pool=True), patch_points=32, radius=0.05, training={})
+    model = build(loaded.network)
+    assert parity_error(loaded, model.SerializeToString()) <= PARITY_TOLERANCE
+    bias = next(weight for weight in model.graph.initializer if weight.name == "head_bias")
+    values = onnx.numpy_helper.to_array(bias).copy()
+    values[1] += 0.01
+    bias.CopyFrom(onnx.numpy_helper.from_array(values, "head_bias"))
+    assert parity_error(loaded, model.SerializeToString()) > PARITY_TOLERANCE

@@ -1,0 +1,137 @@
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import threading
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+
+from pointfilter import Engine, ModelBundle, engine as engine_module
+from pointfilter.engine import MAX_THREADS, available_cpus
+from pointfilter.errors import InvalidModelError, ParameterError, ProviderUnavailableError
+from pointfilter.models import load_bundle
+
+
+def test_the_processor_is_always_there(bundle: ModelBundle) -> None:
+    engine = Engine(bundle, "cpu", threads=3)
+    assert engine.provider == "CPUExecutionProvider"
+    assert (engine.device, engine.threads, engine.bundle) == ("cpu", 3, bundle)
+
+
+def test_auto_takes_the_best_that_is_there(bundle: ModelBundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
+    assert Engine(bundle).device == "cpu"
+
+
+def test_a_provider_that_is_missing_is_an_error_and_no_silent_fallback(
+    bundle: ModelBundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
+    with pytest.raises(ProviderUnavailableError, match="CUDAExecutionProvider.*device=auto"):
+        Engine(bundle, "cuda")
+
+
+def test_a_provider_that_does_not_come_up_is_an_error(bundle: ModelBundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    """onnxruntime falls back by itself where a provider cannot start; that must not pass for the one asked for."""
+    monkeypatch.setitem(engine_module.DEVICES, "other", "OtherExecutionProvider")
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["OtherExecutionProvider"])
+    real = onnxruntime.InferenceSession
+
+    def fall_back(path: Path, options: object, providers: list[str]) -> object:
+        return real(path, options, providers=["CPUExecutionProvider"])
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", fall_back)
+    with pytest.raises(ProviderUnavailableError, match="OtherExecutionProvider was asked for"):
+        Engine(bundle, "other")
+
+
+@pytest.mark.parametrize("device", ["gpu", "", "CPU"])
+def test_an_unknown_device(device: str, bundle: ModelBundle) -> None:
+    with pytest.raises(ParameterError, match="auto, cpu, cuda"):
+        Engine(bundle, device)
+
+
+@pytest.mark.parametrize("threads", [-1, MAX_THREADS + 1])
+def test_threads_out_of_range(threads: int, bundle: ModelBundle) -> None:
+    with pytest.raises(ParameterError, match=f"threads.*{MAX_THREADS}.*{threads}"):
+        Engine(bundle, "cpu", threads)
+
+
+def test_no_threads_means_what_this_process_may_use(bundle: ModelBundle) -> None:
+    assert Engine(bundle, "cpu").threads == available_cpus() >= 1
+
+
+@pytest.mark.parametrize(("quota", "cpus"), [("max 100000", 8), ("150000 100000", 2), ("1000 100000", 1), ("9000000 100000", 8), ("?", 8)])
+def test_the_container_s_quota_counts(quota: str, cpus: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine_module.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    monkeypatch.setattr(Path, "read_text", lambda _: quota)
+    assert available_cpus() == cpus
+
+
+def test_answers_have_a_row_a_patch_at_any_length(engine: Engine) -> None:
+    rng = np.random.default_rng(0)
+    for batch, length in [(1, 1), (3, 64), (7, 500)]:
+        answer = engine(rng.uniform(-1, 1, (batch, length, 3)).astype(np.float32))
+        assert answer.shape == (batch, 3)
+        assert answer.dtype == np.float32
+        assert (np.abs(answer) <= 1).all()
+
+
+def test_padding_with_the_centre_changes_nothing(engine: Engine) -> None:
+    patches = np.random.default_rng(0).uniform(-1, 1, (5, 20, 3)).astype(np.float32)
+    patches[:, 0] = 0
+    padded = np.concatenate([patches, np.zeros((5, 44, 3), np.float32)], axis=1)
+    np.testing.assert_allclose(engine(padded), engine(patches), rtol=0, atol=1e-6)
+
+
+def test_several_threads_may_call_at_once(engine: Engine) -> None:
+    patches = np.random.default_rng(0).uniform(-1, 1, (8, 64, 3)).astype(np.float32)
+    expected = engine(patches)
+    answers: list[np.ndarray] = []
+    threads = [threading.Thread(target=lambda: answers.extend(engine(patches) for _ in range(20))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(answers) == 80
+    assert all((answer == expected).all() for answer in answers)
+
+
+def test_warming_up_is_one_real_inference(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    engine.warm_up()
+    for wrong in (np.zeros((2, 4), np.float32), np.full((2, 3), np.nan, np.float32)):
+        monkeypatch.setattr(Engine, "__call__", lambda self, patches, wrong=wrong: wrong)
+        with pytest.raises(InvalidModelError, match="tiny"):
+            engine.warm_up()
+
+
+def test_weights_that_are_no_graph(bundle: ModelBundle, tmp_path: Path) -> None:
+    (tmp_path / "model.onnx").write_bytes(b"no graph at all")
+    with pytest.raises(InvalidModelError, match="cannot load model 'tiny'"):
+        Engine(dataclasses.replace(bundle, folder=tmp_path), "cpu")
+
+
+@pytest.mark.parametrize(("inputs", "shape"), [(["patches", "more"], ["b", "n", 3]), (["patches"], ["b", 3, "n"]), (["patches"], ["b", "n", 4])])
+def test_a_graph_with_another_door(inputs: list[str], shape: list[object], bundle_folder: Path, tmp_path: Path) -> None:
+    """A valid bundle whose graph takes something else fails when it is loaded or warmed up, as an InvalidModelError."""
+    onnx = pytest.importorskip("onnx")
+    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    nodes = [helper.make_node("ReduceMax", ["patches"], ["out"], axes=[1], keepdims=0)]
+    graph = helper.make_graph(
+        nodes,
+        "other",
+        [helper.make_tensor_value_info(name, kind, shape) for name in inputs],
+        [helper.make_tensor_value_info("out", kind, None)],
+    )
+    serialised = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8).SerializeToString()
+    described = json.loads((bundle_folder / "model.json").read_text())
+    described["sha256"] = hashlib.sha256(serialised).hexdigest()
+    (tmp_path / "model.onnx").write_bytes(serialised)
+    (tmp_path / "model.json").write_text(json.dumps(described))
+    bundle = load_bundle(tmp_path)
+    with pytest.raises(InvalidModelError, match="tiny"):
+        Engine(bundle, "cpu").warm_up()
