@@ -18,7 +18,7 @@ from pointfilter.noise import add_noise
 from training.shapes import Mesh, mesh_of
 
 POINTS = 40_000
-NOISE = 0.006  # of the bounding-box diagonal
+NOISE = 0.01  # of the bounding-box diagonal
 SIZE = 120.0  # the bracket's diagonal in millimetres
 SEED = 7
 

@@ -24,9 +24,8 @@ class Column:
 
     @property
     def line(self) -> str:
-        return f"property list {self.length_type} {self.type} {self.name}" if self.length_type else (
-            f"property {self.type} {self.name}"
-        )  # fmt: skip
+        kind = f"list {self.length_type} {self.type}" if self.length_type else self.type
+        return f"property {kind} {self.name}"
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def write_ply(
     final_newline: bool = True,
     trailing: bytes = b"",
 ) -> Written:
-    """remarks: lines (comment, obj_info) to put before the header's line of that number, the first after `ply` being 0."""
+    """remarks: lines (comment, obj_info) to put before the header's line of that number; 0 is the one after `ply`."""
     lines = [f"format {encoding} 1.0"]
     for table in tables:
         lines.append(f"element {table.name} {len(table.rows)}")
@@ -98,7 +97,9 @@ def _row(
     places = {}
     number = 0
     for column, value in zip(table.columns, row, strict=True):
-        entries = [("length", len(value)), *(("item", item) for item in value)] if column.length_type else [("item", value)]
+        entries = (
+            [("length", len(value)), *(("item", item) for item in value)] if column.length_type else [("item", value)]
+        )
         for kind, entry in entries:
             if encoding == "ascii":
                 if number:

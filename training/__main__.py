@@ -16,6 +16,7 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 # glibc gives large blocks back to the system at every free and faults them in again at every step; keeping them more
 # than doubles the throughput of training on a CPU. Read at process start, hence the exec.
@@ -53,10 +54,20 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: list[str] | None = None) -> int:
-    options = parser().parse_args(arguments)
+def _weights(path: Path) -> dict[str, Any]:
     import torch
 
+    try:
+        weights: dict[str, Any] = torch.load(path, weights_only=True)["network"]
+    except OSError:
+        raise
+    except Exception as error:  # what torch raises for a file that is no checkpoint differs between its versions
+        raise ValueError(f"--init: {path} is no checkpoint of a run") from error
+    return weights
+
+
+def main(arguments: list[str] | None = None) -> int:
+    options = parser().parse_args(arguments)
     from training.presets import load_preset
     from training.train import start
 
@@ -68,7 +79,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.resume and not (folder / "checkpoint.pt").is_file():
             raise FileNotFoundError(f"--resume: no checkpoint.pt in {folder}")
         settings = load_preset(options.preset, overrides)
-        init = torch.load(options.init, weights_only=True)["network"] if options.init else None
+        init = _weights(options.init) if options.init else None
         run = start(
             folder,
             settings,

@@ -139,7 +139,11 @@ def load_author_clouds(folder: Path, radius: float) -> list[TrainingCloud]:
             raise ValueError(f"{normal_path} {normals.shape} and {name}.npy {clean.shape} must both be (n, 3)")
         diagonal = bounding_box_diagonal(clean)
         pattern = re.compile(re.escape(name) + r"_\d+(\.\d+)?\.npy")
-        noisy_paths = [path for path in sorted(folder.glob(f"{name}_*.npy")) if pattern.fullmatch(path.name)]
+        noisy_paths = [  # cube_2.npy is another model where cube_2_normal.npy is there too
+            path
+            for path in sorted(folder.iterdir())
+            if pattern.fullmatch(path.name) and not (folder / f"{path.stem}_normal.npy").exists()
+        ]
         for path in noisy_paths or [folder / f"{name}.npy"]:
             noisy = np.load(path, allow_pickle=False).astype(np.float64)
             clouds.append(make_cloud(noisy, clean, normals, radius * diagonal))

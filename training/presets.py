@@ -40,4 +40,17 @@ def _merge(values: dict[str, Any], changes: dict[str, Any], source: str) -> None
         if isinstance(values[key], dict) and isinstance(value, dict):
             _merge(values[key], value, source)
         else:
-            values[key] = value
+            values[key] = _typed(key, values[key], value, source)
+
+
+def _typed(key: str, old: Any, new: Any, source: str) -> Any:
+    """The new value where it is of the old one's type; a whole number will do for a float."""
+    if isinstance(old, float) and type(new) is int:
+        return float(new)
+    if isinstance(old, tuple | list):
+        if isinstance(new, list) and new and all(type(entry) is type(old[0]) for entry in new):
+            return new
+        raise ValueError(f"{source}: {key} must be a list of {type(old[0]).__name__}, not {new!r}")
+    if type(new) is not type(old):
+        raise ValueError(f"{source}: {key} must be of type {type(old).__name__}, not {new!r}")
+    return new

@@ -68,7 +68,10 @@ def load_meshes(folder: Path) -> list[Mesh]:
         loaded = trimesh.load(path, force="mesh", process=False)
         if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
             raise ValueError(f"{path} holds no triangles")
-        meshes.append(_faceted(np.asarray(loaded.vertices, np.float64), np.asarray(loaded.faces, np.int64)))
+        mesh = _faceted(np.asarray(loaded.vertices, np.float64), np.asarray(loaded.faces, np.int64))
+        if len(mesh.faces) == 0:
+            raise ValueError(f"{path} holds no triangle that has an area")
+        meshes.append(mesh)
     return meshes
 
 

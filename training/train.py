@@ -19,11 +19,16 @@ from tqdm import tqdm
 
 from pointfilter.filtering import filter_points
 from pointfilter.metrics import chamfer_distance
+from pointfilter.noise import NOISE_KINDS
 from training.dataset import DataSettings, TrainingCloud, batches_ahead, cut_batch, training_clouds, validation_cloud
-from training.losses import LossSettings, filtering_loss
+from training.losses import LOSSES, LossSettings, filtering_loss
 from training.network import NetworkSettings, Pointfilter
 
 CHECKPOINT_VERSION = 1
+
+OPTIMIZERS = ("adamw", "sgd")
+SCHEDULES = ("one-cycle", "exponential")
+PRECISIONS = ("auto", "bfloat16", "float32")
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,18 @@ class TrainingSettings:
     checkpoint_every: int = 500
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """A name that nobody knows must not pass for another one. Raises ValueError."""
+        for name, found, known in (
+            ("optimizer", [self.optimizer], OPTIMIZERS),
+            ("schedule", [self.schedule], SCHEDULES),
+            ("precision", [self.precision], PRECISIONS),
+            ("loss.loss", [self.loss.loss], LOSSES),
+            ("data.noise_kinds", self.data.noise_kinds, NOISE_KINDS),
+        ):
+            if not set(found) <= set(known):
+                raise ValueError(f"{name} must be one of {', '.join(known)}, not {', '.join(found)}")
+
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrainingSettings:
         values = dict(values)
@@ -75,7 +92,10 @@ class Run:
         torch.set_num_threads(settings.threads or os.cpu_count() or 1)
         self.network = Pointfilter(settings.network)
         if init is not None:
-            self.network.load_state_dict(init)
+            try:
+                self.network.load_state_dict(init)
+            except RuntimeError as error:
+                raise ValueError(f"the weights to start from do not fit the network: {error}") from error
         moving_average = get_ema_multi_avg_fn(settings.ema_decay)  # type: ignore[no-untyped-call]
         self.average = AveragedModel(self.network, multi_avg_fn=moving_average, use_buffers=True)
         self.optimizer = self._optimizer()
@@ -83,6 +103,8 @@ class Run:
         self.step = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
+        self.source: dict[str, str] = {}
+        """Where the user's own data is: "meshes" or "clouds" and the folder. Empty for procedural shapes."""
         if resume:
             self._load(folder / "checkpoint.pt")
         else:
@@ -112,6 +134,7 @@ class Run:
         self.optimizer.load_state_dict(state["optimizer"])
         self.scheduler.load_state_dict(state["scheduler"])
         self.step, self.seconds, self.history = state["step"], state["seconds"], state["history"]
+        self.source = state.get("source", {})
 
     def save(self) -> None:
         """Writes the checkpoint so that a kill at any moment leaves the old one or the new one, whole."""
@@ -121,6 +144,7 @@ class Run:
             "step": self.step,
             "seconds": self.seconds,
             "history": self.history,
+            "source": self.source,
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -247,6 +271,9 @@ def start(
         saved = torch.load(folder / "checkpoint.pt", weights_only=True)
         settings = TrainingSettings.from_dict(saved["settings"])
     run = Run(folder, settings, resume, init)
+    if meshes or clouds or not resume:
+        run.source = {name: str(path.absolute()) for name, path in (("meshes", meshes), ("clouds", clouds)) if path}
+    meshes, clouds = (Path(run.source[name]) if name in run.source else None for name in ("meshes", "clouds"))
     total = None if clouds else settings.data.clouds
     pool = list(tqdm(training_clouds(settings.data, meshes, clouds), total=total, unit="cloud", desc="clouds"))
     run.train(pool, until)

@@ -167,13 +167,14 @@ def _walk(
             count = length.unpack_from(data, position)[0] if position + length.size <= size else 0
             if count < 0 or position + length.size + count * item > size:
                 raise MalformedFileError(
-                    f"byte {position}: row {row} of element {shown(element.name)} has a list {shown(name)} of {count} items, "
-                    f"which the file of {size} bytes does not hold"
+                    f"byte {position}: row {row} of element {shown(element.name)} has a list {shown(name)} of {count} "
+                    f"items, which the file of {size} bytes does not hold"
                 )
             position += length.size + count * item
         if position > size or (row + 1 < element.count and position == size):
             raise MalformedFileError(
-                f"the file ends at byte {size}, in row {row} of element {shown(element.name)}", hint="the file is truncated"
+                f"the file ends at byte {size}, in row {row} of element {shown(element.name)}",
+                hint="the file is truncated",
             )
     if not wanted:
         return position, None

@@ -50,17 +50,21 @@ def read_and_write(data: bytes, folder: Path) -> None:
     try:
         cloud = PointCloud.read(path)
     except InputError as error:
-        assert str(error).isascii()
-        assert str(error).isprintable()
+        refusal = str(error)
+    else:
+        refusal = ""
+    assert refusal.isascii()
+    assert refusal == "" or refusal.isprintable()
+    if refusal:
         return
     with np.errstate(all="ignore"):
         moved = cloud.with_xyz(cloud.xyz + 0.5)
     for encoding in ("same", *ENCODINGS):
         try:
             moved.write(target, encoding, comment="ours")
-        except (InputError, ParameterError) as error:
-            assert encoding != "same"
-            assert str(error)
+        except (InputError, ParameterError):
+            if encoding == "same":
+                raise
         else:
             assert len(PointCloud.read(target)) == len(cloud)
             target.unlink()
@@ -80,10 +84,23 @@ def test_changed_bytes(name: str, changes: list[tuple[float, int]], tmp_path_fac
 
 
 LINES = [
-    "comment", "obj_info x", "element vertex 2", "element face 1", "element e 3", "element e 0", "property float x",
-    "property double y", "property float32 z", "property uchar red", "property list uchar int vertex_indices",
-    "property list int double q", "property list char float z", "format ascii 1.0", "", "property short s",
-]  # fmt: skip
+    "comment",
+    "obj_info x",
+    "element vertex 2",
+    "element face 1",
+    "element e 3",
+    "element e 0",
+    "property float x",
+    "property double y",
+    "property float32 z",
+    "property uchar red",
+    "property list uchar int vertex_indices",
+    "property list int double q",
+    "property list char float z",
+    "format ascii 1.0",
+    "",
+    "property short s",
+]
 
 
 @settings(max_examples=150)
@@ -97,7 +114,9 @@ LINES = [
         ),
     ),
 )
-def test_headers_of_all_sorts(encoding: str, lines: list[str], body: bytes, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_headers_of_all_sorts(
+    encoding: str, lines: list[str], body: bytes, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     vertex = ["element vertex 2", "property float x", "property float y", "property float z"]
     data = "\n".join(["ply", f"format {encoding} 1.0", *vertex, *lines, "end_header", ""]).encode() + body
     read_and_write(data, tmp_path_factory.mktemp("header"))
@@ -105,9 +124,19 @@ def test_headers_of_all_sorts(encoding: str, lines: list[str], body: bytes, tmp_
 
 @pytest.mark.parametrize(
     "row",
-    ["1 2 3 300 0", "1 2 3 -1 0", "1 2 3 1.5 0", "1 2 3 x 0", "1 2 3 1e999 0", "1 2 3 0 2 300 1", "1 2 3 0 1 -1", "1 2 3 0 1 nan",
-     "1 2 3 nan 0", "1 2 3 99999999999999999999999 0"],
-)  # fmt: skip
+    [
+        "1 2 3 300 0",
+        "1 2 3 -1 0",
+        "1 2 3 1.5 0",
+        "1 2 3 x 0",
+        "1 2 3 1e999 0",
+        "1 2 3 0 2 300 1",
+        "1 2 3 0 1 -1",
+        "1 2 3 0 1 nan",
+        "1 2 3 nan 0",
+        "1 2 3 99999999999999999999999 0",
+    ],
+)
 @pytest.mark.parametrize("encoding", sorted(ORDERS))
 def test_text_that_its_type_cannot_hold_is_no_traceback_when_converted(row: str, encoding: str, tmp_path: Path) -> None:
     header = (
@@ -117,7 +146,7 @@ def test_text_that_its_type_cannot_hold_is_no_traceback_when_converted(row: str,
     read_and_write(f"{header}{row}\n".encode(), tmp_path)
 
 
-# --- limits -----------------------------------------------------------------------------------------------------------
+# --- limits ---
 
 
 def test_the_limit_of_points_names_value_limit_and_knob(tmp_path: Path) -> None:
@@ -165,7 +194,7 @@ def test_a_list_that_reaches_over_the_end_by_one_byte(order: str, tmp_path: Path
         PointCloud.read(path)
 
 
-# --- what is no file --------------------------------------------------------------------------------------------------
+# --- what is no file ---
 
 
 def test_directories_and_missing_files_are_the_system_s_errors(tmp_path: Path) -> None:

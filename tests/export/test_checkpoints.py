@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import pickle
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ class Encoder(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        for number, (a, b) in enumerate(zip(WIDTHS, WIDTHS[1:], strict=False), 1):
+        for number, (a, b) in enumerate(pairwise(WIDTHS), 1):
             setattr(self, f"conv{number}", nn.Conv1d(a, b, 1))
             setattr(self, f"bn{number}", nn.BatchNorm1d(b))
 
@@ -140,7 +141,9 @@ def test_a_checkpoint_that_is_none(name: str, tmp_path: Path) -> None:
         load_checkpoint(path)
 
 
-@pytest.mark.parametrize("content", [b"", b"garbage", b"PK\x03\x04" + bytes(100), b"\x80\x02}q\x00."], ids=["empty", "text", "zip", "pickle"])
+@pytest.mark.parametrize(
+    "content", [b"", b"garbage", b"PK\x03\x04" + bytes(100), b"\x80\x02}q\x00."], ids=["empty", "text", "zip", "pickle"]
+)
 def test_a_file_that_is_no_checkpoint(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "garbage.pt"
     path.write_bytes(content)

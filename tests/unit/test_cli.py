@@ -117,7 +117,7 @@ def test_another_encoding(encoding: str, noisy_file: Path, tmp_path: Path) -> No
     np.testing.assert_array_equal(cloud.xyz, same.xyz)
 
 
-# --- refusals -----------------------------------------------------------------------------------------------------------
+# --- refusals ---
 
 
 @pytest.mark.parametrize(
@@ -133,13 +133,24 @@ def test_another_encoding(encoding: str, noisy_file: Path, tmp_path: Path) -> No
         ("--device", "tpu", "auto, cpu, cuda"),
     ],
 )
-def test_parameters_out_of_range(option: str, value: object, told: str, noisy_file: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_parameters_out_of_range(
+    option: str, value: object, told: str, noisy_file: Path, tmp_path: Path, capsys: Capture
+) -> None:
     assert told in refused(capsys, 2, "filter", noisy_file, tmp_path / "a.ply", f"{option}={value}")
     assert not (tmp_path / "a.ply").exists()
 
 
-@pytest.mark.parametrize("arguments", [[], ["filter"], ["filter", "a.ply"], ["polish"], ["filter", "a", "b", "--format", "las"],
-                                       ["filter", "a", "b", "--iterations", "two"]])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["filter"],
+        ["filter", "a.ply"],
+        ["polish"],
+        ["filter", "a", "b", "--format", "las"],
+        ["filter", "a", "b", "--iterations", "two"],
+    ],
+)
 def test_wrong_usage(arguments: list[str], capsys: Capture) -> None:
     with pytest.raises(SystemExit) as caught:
         run(*arguments)
@@ -164,7 +175,9 @@ def test_inputs_that_cannot_be_filtered(name: str, tmp_path: Path, capsys: Captu
     assert [path.name for path in tmp_path.iterdir()] == ["in.ply"]
 
 
-def test_suffixes_are_looked_at_before_the_work(noisy_file: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_suffixes_are_looked_at_before_the_work(
+    noisy_file: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def never(*_: object, **__: object) -> None:
         raise AssertionError("the work has begun")
 
@@ -193,7 +206,9 @@ def test_models_that_cannot_be_used(noisy_file: Path, tmp_path: Path, bundle_fol
     assert "sha256" in refused(capsys, 4, "filter", noisy_file, tmp_path / "a.ply", "--model", broken)
 
 
-def test_a_device_that_is_not_there(noisy_file: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_that_is_not_there(
+    noisy_file: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import onnxruntime
 
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
@@ -207,7 +222,9 @@ def test_files_that_are_not_there(noisy_file: Path, tmp_path: Path, capsys: Capt
     assert str(missing) in refused(capsys, 5, "evaluate", noisy_file, missing)
 
 
-def test_an_interruption_leaves_nothing_behind(noisy_file: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interruption_leaves_nothing_behind(
+    noisy_file: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
@@ -227,7 +244,7 @@ def test_every_error_that_a_command_can_meet_has_an_exit_code() -> None:
         assert issubclass(kind, tuple(cli.EXIT_CODES)) or kind is FilteringCancelledError
 
 
-# --- the others ---------------------------------------------------------------------------------------------------------
+# --- the others ---
 
 
 def test_info(noisy_file: Path, capsys: Capture) -> None:
@@ -253,7 +270,9 @@ def test_info_of_a_cloud_that_is_nowhere(rows: list[tuple[float, ...]], tmp_path
 
 def test_info_does_not_let_a_file_talk_to_the_terminal(tmp_path: Path, capsys: Capture) -> None:
     data = ply_bytes("ascii", [(1.0, 2.0, 3.0)]).replace(b"end_header", b"comment \x1b[2J\x07 \xc3\xa9\nend_header")
-    (tmp_path / "a.ply").write_bytes(data.replace(b"float z\n", b"float z\nproperty float \x1b[31m\n").replace(b"3.0\n", b"3.0 4\n"))
+    (tmp_path / "a.ply").write_bytes(
+        data.replace(b"float z\n", b"float z\nproperty float \x1b[31m\n").replace(b"3.0\n", b"3.0 4\n")
+    )
     assert run("info", tmp_path / "a.ply") == 0
     text = capsys.readouterr().out
     assert all(line.isprintable() for line in text.splitlines())
@@ -279,7 +298,9 @@ def test_evaluate_against_a_mesh(tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "clean.ply").write_bytes(ply_bytes("ascii", sheet))
     corners = [(-9.0, -9.0, 0.0), (9.0, -9.0, 0.0), (0.0, 9.0, 0.0)]
     (tmp_path / "mesh.ply").write_bytes(ply_bytes("ascii", corners, faces=[(0, 1, 2)]))
-    assert run("evaluate", tmp_path / "clean.ply", tmp_path / "clean.ply", "--mesh", tmp_path / "mesh.ply", "--json") == 0
+    assert (
+        run("evaluate", tmp_path / "clean.ply", tmp_path / "clean.ply", "--mesh", tmp_path / "mesh.ply", "--json") == 0
+    )
     assert json.loads(capsys.readouterr().out)["filtered"]["P2F x1e3"] == pytest.approx(0, abs=1e-9)
     assert "faces" in refused(capsys, 3, "evaluate", *[tmp_path / "clean.ply"] * 2, "--mesh", tmp_path / "clean.ply")
 
@@ -304,7 +325,7 @@ def test_doctor(capsys: Capture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     assert "no model" in refused(capsys, 4, "doctor")
 
 
-# --- as a process -------------------------------------------------------------------------------------------------------
+# --- as a process ---
 
 
 def process(*arguments: object, stdin: bytes = b"") -> subprocess.CompletedProcess[bytes]:

@@ -40,7 +40,7 @@ def test_finite_rows() -> None:
 
 @pytest.mark.parametrize("encoding", ["same", *ENCODINGS])
 def test_a_cloud_of_arrays_can_be_written(encoding: str, tmp_path: Path) -> None:
-    xyz = np.random.default_rng(0).normal(size=(20, 3)) + [5e5, 5e6, 0]
+    xyz = np.random.default_rng(0).normal(size=(20, 3)) + np.array([5e5, 5e6, 0])
     path = tmp_path / "new.ply"
     PointCloud(xyz).write(path, encoding, comment="made in a test")
     again = PointCloud.read(path)
@@ -53,7 +53,13 @@ def test_a_cloud_of_arrays_can_be_written(encoding: str, tmp_path: Path) -> None
 @pytest.mark.parametrize("before", ENCODINGS)
 @pytest.mark.parametrize("after", ENCODINGS)
 def test_every_value_survives_a_change_of_encoding(before: str, after: str, tmp_path: Path) -> None:
-    layout = [Column("x", "double"), Column("red", "uchar"), Column("y", "float"), Column("z", "double"), Column("w", "short")]
+    layout = [
+        Column("x", "double"),
+        Column("red", "uchar"),
+        Column("y", "float"),
+        Column("z", "double"),
+        Column("w", "short"),
+    ]
     rows = [[0.1 + k, k, 0.25 * k, 1e-7 * k, -k] for k in range(9)]
     faces = [[[0, 1, 2]], [[3, 4, 5, 6]]]
     tables = [Table("vertex", layout, rows), Table("face", [Column("vertex_indices", "int", "uchar")], faces)]
@@ -61,7 +67,7 @@ def test_every_value_survives_a_change_of_encoding(before: str, after: str, tmp_
     source.write_bytes(write_ply(before, tables, remarks={0: [b"comment kept", b"obj_info kept too"]}).data)
     PointCloud.read(source).write(target, after)
     PointCloud.read(target).write(back, before)
-    cloud, converted, returned = (PointCloud.read(path) for path in (source, target, back))
+    cloud, converted = PointCloud.read(source), PointCloud.read(target)
     np.testing.assert_array_equal(converted.xyz, cloud.xyz)
     assert converted.source is not None
     assert cloud.source is not None

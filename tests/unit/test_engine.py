@@ -10,7 +10,8 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from pointfilter import Engine, ModelBundle, engine as engine_module
+from pointfilter import Engine, ModelBundle
+from pointfilter import engine as engine_module
 from pointfilter.engine import MAX_THREADS, available_cpus
 from pointfilter.errors import InvalidModelError, ParameterError, ProviderUnavailableError
 from pointfilter.models import load_bundle
@@ -31,7 +32,7 @@ def test_a_provider_that_is_missing_is_an_error_and_no_silent_fallback(
     bundle: ModelBundle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
-    with pytest.raises(ProviderUnavailableError, match="CUDAExecutionProvider.*device=auto"):
+    with pytest.raises(ProviderUnavailableError, match=r"CUDAExecutionProvider.*device=auto"):
         Engine(bundle, "cuda")
 
 
@@ -65,7 +66,9 @@ def test_no_threads_means_what_this_process_may_use(bundle: ModelBundle) -> None
     assert Engine(bundle, "cpu").threads == available_cpus() >= 1
 
 
-@pytest.mark.parametrize(("quota", "cpus"), [("max 100000", 8), ("150000 100000", 2), ("1000 100000", 1), ("9000000 100000", 8), ("?", 8)])
+@pytest.mark.parametrize(
+    ("quota", "cpus"), [("max 100000", 8), ("150000 100000", 2), ("1000 100000", 1), ("9000000 100000", 8), ("?", 8)]
+)
 def test_the_container_s_quota_counts(quota: str, cpus: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine_module.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
     monkeypatch.setattr(Path, "read_text", lambda _: quota)
@@ -115,7 +118,10 @@ def test_weights_that_are_no_graph(bundle: ModelBundle, tmp_path: Path) -> None:
         Engine(dataclasses.replace(bundle, folder=tmp_path), "cpu")
 
 
-@pytest.mark.parametrize(("inputs", "shape"), [(["patches", "more"], ["b", "n", 3]), (["patches"], ["b", 3, "n"]), (["patches"], ["b", "n", 4])])
+@pytest.mark.parametrize(
+    ("inputs", "shape"),
+    [(["patches", "more"], ["b", "n", 3]), (["patches"], ["b", 3, "n"]), (["patches"], ["b", "n", 4])],
+)
 def test_a_graph_with_another_door(inputs: list[str], shape: list[object], bundle_folder: Path, tmp_path: Path) -> None:
     """A valid bundle whose graph takes something else fails when it is loaded or warmed up, as an InvalidModelError."""
     onnx = pytest.importorskip("onnx")

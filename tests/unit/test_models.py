@@ -76,8 +76,20 @@ CHANGES: dict[str, Change] = {
     "no schema": lambda d: d.pop("schema"),
     "another frame": lambda d: d.update(frame="pca-third-moment"),
     "another digest": lambda d: d.update(sha256="0" * 64),
-    **{f"no {name}": lambda d, name=name: d.pop(name) for name in ("name", "version", "sha256", "patch_points", "radius",
-                                                                    "iterations", "network", "training", "scores")},
+    **{
+        f"no {name}": lambda d, name=name: d.pop(name)
+        for name in (
+            "name",
+            "version",
+            "sha256",
+            "patch_points",
+            "radius",
+            "iterations",
+            "network",
+            "training",
+            "scores",
+        )
+    },
     "points as text": lambda d: d.update(patch_points="64"),
     "no points": lambda d: d.update(patch_points=0),
     "negative points": lambda d: d.update(patch_points=-5),
@@ -86,7 +98,7 @@ CHANGES: dict[str, Change] = {
     "radius over all": lambda d: d.update(radius=1.5),
     "no iterations": lambda d: d.update(iterations=0),
     "iterations for ever": lambda d: d.update(iterations=10**6),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CHANGES)

@@ -44,7 +44,7 @@ def random_cloud(kind: str, rng: np.random.Generator) -> np.ndarray:
     if kind == "duplicates":
         return rng.uniform(-1, 1, (60, 3)).repeat(5, axis=0)
     if kind == "utm":
-        return rng.uniform(-1, 1, (300, 3)) + [5e5, 5e6, 120.0]
+        return rng.uniform(-1, 1, (300, 3)) + np.array([5e5, 5e6, 120.0])
     if kind == "stray":  # one point so far away that the grid has to be coarser than the radius
         return np.vstack([rng.uniform(-1, 1, (299, 3)), [[1e9, -1e9, 1e9]]])
     assert kind == "grid"
@@ -120,7 +120,7 @@ def test_a_radius_that_is_none_is_refused(radius: float) -> None:
         index_of(np.zeros((3, 3)), radius)
 
 
-# --- downsampling -----------------------------------------------------------------------------------------------------
+# --- downsampling ---
 
 
 @given(seed=st.integers(0, 2**32), wanted=st.integers(1, 60), key=st.integers(0, 2**64 - 1))
@@ -213,7 +213,7 @@ def test_sampling_keys_differ_and_are_64_bits() -> None:
     assert sampling_key(2**63 - 1, 99) not in keys
 
 
-# --- stable ids -------------------------------------------------------------------------------------------------------
+# --- stable ids ---
 
 
 def test_ids_are_ranks_and_equal_points_share_one() -> None:

@@ -130,7 +130,9 @@ def test_a_patch_holds_the_rows_that_sample_names() -> None:
     np.testing.assert_allclose(patches.points, offsets @ patches.frames.transpose(0, 2, 1), atol=1e-6)
 
 
-@given(counts=st.lists(st.integers(0, 2000), max_size=80), longest=st.integers(1, 600), step=st.sampled_from([1, 32, 50]))
+@given(
+    counts=st.lists(st.integers(0, 2000), max_size=80), longest=st.integers(1, 600), step=st.sampled_from([1, 32, 50])
+)
 def test_buckets_hold_every_patch_once_at_a_length_that_fits(counts: list[int], longest: int, step: int) -> None:
     numbers = np.array(counts, dtype=np.int64)
     seen: list[int] = []
@@ -142,7 +144,7 @@ def test_buckets_hold_every_patch_once_at_a_length_that_fits(counts: list[int], 
     assert sorted(seen) == list(range(len(counts)))
 
 
-# --- the compiled module checks its buffers -----------------------------------------------------------------------------
+# --- the compiled module checks its buffers ---
 
 
 def test_buffers_that_do_not_fit_are_refused() -> None:
@@ -161,7 +163,7 @@ def test_buffers_that_do_not_fit_are_refused() -> None:
         )
     with pytest.raises(ValueError, match="indices"):
         _native.sample_neighbours(arrays, points, ids, 1.0, 0, np.empty(21, np.int64), counts)
-    with pytest.raises(ValueError, match="ids|points"):
+    with pytest.raises(ValueError, match=r"ids|points"):
         _native.count_neighbours((arrays[0], ids[:5].copy(), *arrays[2:]), points, 1.0, counts)
     counts.setflags(write=False)
     with pytest.raises(ValueError, match="read-only"):

@@ -19,7 +19,9 @@ def test_a_radius_is_a_share_or_a_length(text: str, value: float, relative: bool
     assert radius.relative is relative
 
 
-@pytest.mark.parametrize("text", ["", "%", "0", "0%", "-1", "-5%", "100.1%", "nan", "inf", "nan%", "5 percent", "1e400", "5%%"])
+@pytest.mark.parametrize(
+    "text", ["", "%", "0", "0%", "-1", "-5%", "100.1%", "nan", "inf", "nan%", "5 percent", "1e400", "5%%"]
+)
 def test_a_radius_that_is_none_names_both_forms(text: str) -> None:
     with pytest.raises(ParameterError, match=r"0\.02.*5%") as caught:
         Radius.parse(text)
@@ -42,7 +44,9 @@ def test_the_defaults_are_the_bundle_s(engine: Engine, noisy_crease: np.ndarray)
 
 
 def test_the_report_says_what_was_done(engine: Engine, noisy_crease: np.ndarray) -> None:
-    clean, report = filter_cloud(PointCloud(noisy_crease.copy()), engine, iterations=1, radius=Radius(0.2, False), seed=9)
+    clean, report = filter_cloud(
+        PointCloud(noisy_crease.copy()), engine, iterations=1, radius=Radius(0.2, False), seed=9
+    )
     moved = np.linalg.norm(clean.xyz - noisy_crease, axis=1)
     assert report.mean_displacement == pytest.approx(moved.mean())
     assert report.largest_displacement == pytest.approx(moved.max())

@@ -31,14 +31,20 @@ def number(type_: str) -> st.SearchStrategy[object]:
     return st.floats(width=32 if code == "f" else 64)
 
 
-coordinate_text = st.sampled_from(["0", "-0.0", "1.50", "+2", "1e-3", "00012.5000", "3.", ".25", "7E2", "nan", "-inf", "1e-400"])
-names = st.text(st.characters(codec="ascii", categories=["Ll", "Lu", "Nd"], include_characters="_"), min_size=1, max_size=12)
+coordinate_text = st.sampled_from(
+    ["0", "-0.0", "1.50", "+2", "1e-3", "00012.5000", "3.", ".25", "7E2", "nan", "-inf", "1e-400"]
+)
+names = st.text(
+    st.characters(codec="ascii", categories=["Ll", "Lu", "Nd"], include_characters="_"), min_size=1, max_size=12
+)
 remark = st.builds(
     lambda word, text: word + b" " + text,
     st.sampled_from([b"comment", b"obj_info"]),
     st.one_of(
         st.text(st.characters(exclude_characters="\r\n", codec="utf-8"), max_size=20).map(str.encode),
-        st.text(st.characters(exclude_characters="\r\n", codec="latin-1"), max_size=20).map(lambda t: t.encode("latin-1")),
+        st.text(st.characters(exclude_characters="\r\n", codec="latin-1"), max_size=20).map(
+            lambda t: t.encode("latin-1")
+        ),
     ),
 )
 
@@ -93,11 +99,19 @@ def ply_files(draw: st.DrawFn) -> Sample:
     lines = 1 + sum(1 + len(table.columns) for table in elements)
     remarks = draw(st.dictionaries(st.integers(0, lines), st.lists(remark, min_size=1, max_size=2), max_size=3))
     newline = draw(st.sampled_from([b"\n", b"\r\n"]))
-    separators = draw(st.lists(st.sampled_from([b" ", b"  ", b"\t", b" \t "]), min_size=1, max_size=3)) if ascii_ else [b" "]
+    separators = (
+        draw(st.lists(st.sampled_from([b" ", b"  ", b"\t", b" \t "]), min_size=1, max_size=3)) if ascii_ else [b" "]
+    )
     final = draw(st.booleans())
     trailing = draw(st.sampled_from([b"", b"\n", b"rest of\x00 the file", b"\r\n\r\n"])) if final else b""
     written = write_ply(
-        encoding, elements, newline=newline, separators=separators, remarks=remarks, final_newline=final, trailing=trailing
+        encoding,
+        elements,
+        newline=newline,
+        separators=separators,
+        remarks=remarks,
+        final_newline=final,
+        trailing=trailing,
     )
     return Sample(encoding, newline, {column.name: column.type for column in axes}, written)
 
@@ -168,7 +182,10 @@ def test_only_x_y_z_and_our_comment_differ(sample: Sample, seed: int) -> None:
             new += start - old
             length = stop - start if sample.encoding != "ascii" else len(after[new:].split(None, 1)[0])
             piece = after[new : new + length]
-            was, now = stored(sample, axis, before.data[start:stop]), in_type(row[AXES.index(axis)], CODES[sample.types[axis]])
+            was, now = (
+                stored(sample, axis, before.data[start:stop]),
+                in_type(row[AXES.index(axis)], CODES[sample.types[axis]]),
+            )
             if same(was, now) or not math.isfinite(now):
                 assert piece == before.data[start:stop]
             else:
@@ -194,7 +211,7 @@ def test_the_summary_says_what_is_in_the_file(sample: Sample) -> None:
     assert len(summary["obj_info"]) == sum(line.startswith(b"obj_info") for line in lines)
 
 
-# --- after the filter ---------------------------------------------------------------------------------------------------
+# --- after the filter ---
 
 
 def scan(encoding: str, rng: np.random.Generator) -> Written:
@@ -204,7 +221,15 @@ def scan(encoding: str, rng: np.random.Generator) -> Written:
         Column("z", "double"), Column("views", "int", "uchar"), Column("scalar_gps_time", "double"),
     ]  # fmt: skip
     rows = [
-        [498_765.0 + x, int(rng.integers(256)), float(np.float32(y)), float(np.float32(nx)), z, [1, 2, 3][: k % 4], 1e9 * t]
+        [
+            498_765.0 + x,
+            int(rng.integers(256)),
+            float(np.float32(y)),
+            float(np.float32(nx)),
+            z,
+            [1, 2, 3][: k % 4],
+            1e9 * t,
+        ]
         for k, (x, y, z, nx, t) in enumerate(rng.uniform(size=(200, 5)))
     ]
     for row in rows[::10]:
@@ -285,7 +310,9 @@ def test_a_coordinate_that_does_not_fit_its_type_stays() -> None:
 
 @pytest.mark.parametrize("text", ["1e39", "1e400", "-1e39"])
 def test_text_beyond_its_type_is_infinite_and_stays(text: str) -> None:
-    data = write_ply("ascii", [Table("vertex", [Column(axis, "float") for axis in AXES], [[text, "0", "0"], ["1", "2", "3"]])]).data
+    data = write_ply(
+        "ascii", [Table("vertex", [Column(axis, "float") for axis in AXES], [[text, "0", "0"], ["1", "2", "3"]])]
+    ).data
     cloud, after = through(data, np.array([[0, 0, 0], [1.0, 0, 0]]))
     assert cloud.finite.tolist() == [False, True]
     assert after == data.replace(b"\n1 2 3", b"\n2.0 2 3")
@@ -300,9 +327,9 @@ def test_new_text_is_the_shortest_that_reads_back(type_: str) -> None:
     found = [token for line in lines for token in line.split()]
     kind = np.float32 if type_ == "float" else np.float64
     expected = [0.1, 1 / 3, 1e-12, 498765.123456789, -2.5, 0, 1e20, 0, 0]
-    for token, value in zip(found, expected, strict=True):
-        assert kind(token) == kind(value)
-        assert token == "0" or len(token) <= len(str(kind(value)))
+    for text, value in zip(found, expected, strict=True):
+        assert kind(text) == kind(value)
+        assert text == "0" or len(text) <= len(str(kind(value)))
 
 
 def test_a_line_ending_of_end_header_s_own_is_kept() -> None:

@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import pytest
+
+from training.dataset import TrainingCloud, training_clouds
+from training.presets import load_preset
+from training.train import TrainingSettings
+
+TINY = [
+    "network.encoder=[8, 16]",
+    "network.decoder=[8]",
+    "data.clouds=2",
+    "data.fewest_points=1000",
+    "data.most_points=2000",
+    "data.clean_points=2000",
+    "data.patch_points=32",
+    "data.clean_patch_points=48",
+    "data.batch=16",
+    "data.clouds_per_batch=4",
+    "steps=12",
+    "threads=1",
+    'precision="float32"',
+    "validation_clouds=0",
+    "validate_every=4",
+    "checkpoint_every=4",
+]
+
+
+@pytest.fixture(scope="session")
+def tiny() -> TrainingSettings:
+    return load_preset("smoke", TINY)
+
+
+@pytest.fixture(scope="session")
+def clouds(tiny: TrainingSettings) -> list[TrainingCloud]:
+    return list(training_clouds(tiny.data))

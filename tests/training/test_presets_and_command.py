@@ -1,0 +1,158 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.training.conftest import TINY
+from training import __main__ as command
+from training.presets import load_preset, preset_names
+from training.train import TrainingSettings
+
+
+def test_every_preset_loads() -> None:
+    assert preset_names() == ["default", "paper", "smoke"]
+    for name in preset_names():
+        assert isinstance(load_preset(name), TrainingSettings)
+
+
+def test_the_paper_s_preset_has_the_paper_s_numbers() -> None:
+    paper = load_preset("paper")
+    assert paper.network.encoder == (64, 128, 256, 512, 1024)
+    assert paper.network.decoder == (512, 256)
+    assert not paper.network.norm_after_pool
+    clouds, patches, epochs, batch = 132, 8000, 50, 64
+    assert paper.data.clouds == clouds
+    assert paper.data.batch == batch
+    assert paper.steps == clouds * patches * epochs // batch
+    assert (paper.optimizer, paper.schedule) == ("sgd", "exponential")
+    assert (paper.learning_rate, paper.final_learning_rate) == (1e-4, 1e-8)
+    assert (paper.data.fewest_points, paper.data.most_points, paper.data.clean_points) == (100_000,) * 3
+    assert (paper.data.noise_low, paper.data.noise_high, paper.data.noise_kinds) == (0.0, 0.025, ("gaussian",))
+    assert (paper.data.radius, paper.data.patch_points) == (0.05, 500)
+    loss = paper.loss
+    assert (loss.loss, loss.eta, loss.sigma_n_degrees, loss.sigma_p, loss.sigma_p_points) == (
+        "bilateral",
+        0.97,
+        15.0,
+        0.0,
+        500,
+    )
+    assert loss.tangential_weight == 0
+    assert not loss.theta_squared
+
+
+def test_settings_can_be_changed_one_by_one() -> None:
+    settings = load_preset(
+        "smoke",
+        [
+            "steps=7",
+            "loss.eta=0.5",
+            "network.encoder=[4, 5]",
+            'data.noise_kinds=["uniform", "outliers"]',
+            "learning_rate=1",
+        ],
+    )
+    assert (settings.steps, settings.loss.eta, settings.network.encoder) == (7, 0.5, (4, 5))
+    assert settings.data.noise_kinds == ("uniform", "outliers")
+    assert settings.learning_rate == 1.0
+    assert settings.data.clouds == load_preset("smoke").data.clouds
+
+
+WRONG = {
+    "stepps=7": "stepps",
+    "loss.etta=1": "etta",
+    "data.loss.eta=1": "loss",
+    "steps": "KEY=VALUE",
+    "steps=": "KEY=VALUE",
+    "steps=seven": "KEY=VALUE",
+    'steps="seven"': "steps",
+    "steps=7.5": "steps",
+    "steps=true": "steps",
+    "steps=[7]": "steps",
+    "data=7": "data",
+    'optimizer="lion"': "adamw",
+    'schedule="cosine"': "one-cycle",
+    'precision="float64"': "bfloat16",
+    'loss.loss="chamfer"': "bilateral",
+    'data.noise_kinds=["pink"]': "gaussian",
+    "data.noise_kinds=[]": "noise_kinds",
+    'network.encoder=["wide"]': "encoder",
+    "network.encoder=[]": "encoder",
+    "network.encoder=7": "encoder",
+}
+
+
+@pytest.mark.parametrize("override", WRONG)
+def test_a_setting_that_there_is_not(override: str) -> None:
+    with pytest.raises(ValueError, match=WRONG[override]):
+        load_preset("smoke", [override])
+
+
+def test_a_preset_that_there_is_not() -> None:
+    with pytest.raises(ValueError, match="default, paper, smoke"):
+        load_preset("grand")
+
+
+def test_a_checkpoint_of_an_older_run_still_has_settings() -> None:
+    import dataclasses
+
+    settings = load_preset("smoke")
+    assert TrainingSettings.from_dict(dataclasses.asdict(settings)) == settings
+
+
+# --- the command ---
+
+
+def train(out: Path, *arguments: object) -> int:
+    options = [word for line in TINY for word in ("--set", line)]
+    return command.main(["--out", str(out), "--preset", "smoke", *options, *map(str, arguments)])
+
+
+def test_the_command_trains_stops_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert train(tmp_path / "run", "--until", 3, "--seed", 4) == 0
+    assert "3 steps" in capsys.readouterr().out
+    state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    assert (state["settings"]["seed"], state["settings"]["data"]["seed"]) == (4, 4)
+    assert command.main(["--out", str(tmp_path / "run"), "--resume"]) == 0
+    assert "12 steps" in capsys.readouterr().out
+    assert train(tmp_path / "other", "--init", tmp_path / "run" / "checkpoint.pt", "--until", 1) == 0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--set", "stepps=7"],
+        ["--set", 'optimizer="lion"'],
+        ["--resume"],
+        ["--init", "missing.pt"],
+        ["--init", "garbage.pt"],
+        ["--init", "empty.pt"],
+        ["--init", "other.pt"],
+        ["--meshes", "missing"],
+        ["--meshes", "empty"],
+        ["--clouds", "empty"],
+    ],
+    ids=" ".join,
+)
+def test_the_command_says_what_is_wrong(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("empty").mkdir()
+    Path("garbage.pt").write_bytes(b"garbage")
+    torch.save({}, "empty.pt")
+    torch.save({"network": {"layer.weight": torch.zeros(3)}}, "other.pt")
+    assert train(tmp_path / "run", *arguments) == 2
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--preset", "grand"], ["--meshes", "a", "--clouds", "b"], ["--until", "soon"]], ids=" ".join
+)
+def test_wrong_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        command.main(arguments)
+    assert caught.value.code == 2
