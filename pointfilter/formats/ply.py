@@ -2,16 +2,16 @@
 
 The file is not taken apart and put together again: the coordinates are read from its bytes and, on the way out, written
 into a copy of them. So other columns, lists, faces, comments, spelling and line endings cannot get lost, and what comes
-after the vertices is checked but never held as objects. plyfile writes clouds that come from arrays and converts
-encodings; docs/adr/0003-ply-by-splicing.md says why it does not do the rest.
+after the vertices is checked but never held as objects. plyfile writes clouds that come from arrays;
+docs/adr/0003-ply-by-splicing.md says why it does not do the rest.
 """
 
 from __future__ import annotations
 
 import mmap
 import os
+import secrets
 import struct
-import tempfile
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from pointfilter.cloud import PointCloud
 from pointfilter.errors import MalformedFileError, ParameterError
+from pointfilter.formats.ply_convert import STRUCT_CODES, convert
 from pointfilter.formats.ply_header import ENCODINGS, TYPES, ByteOrder, Element, Header, Property, read_header, shown
 from pointfilter.limits import ReadLimits
 
@@ -79,9 +80,9 @@ def write(cloud: PointCloud, path: Path, encoding: str = "same", comment: str | 
         raise ParameterError(f"format must be one of same, {', '.join(ENCODINGS)}, got {encoding!r}", actual=encoding)
     if comment is not None and not (comment.isascii() and comment.isprintable()):
         raise ValueError("a comment must be one line of printable ASCII")
-    handle, partial = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".partial")
+    partial = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.partial")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with partial.open("xb") as file:  # not a private file of tempfile's: the result is the user's ordinary one
             if isinstance(cloud.source, PlySource):
                 _write_spliced(cloud, cloud.source, file, comment)
             else:
@@ -90,13 +91,10 @@ def write(cloud: PointCloud, path: Path, encoding: str = "same", comment: str | 
             cloud.source.header.encoding if isinstance(cloud.source, PlySource) else "binary_little_endian"
         )
         if encoding not in ("same", source_encoding):
-            _convert(Path(partial), encoding)
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(partial, 0o666 & ~mask)  # mkstemp makes it private; the result is the user's ordinary file
+            convert(partial, encoding)
         os.replace(partial, path)
     except BaseException:
-        Path(partial).unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
         raise
 
 
@@ -184,12 +182,11 @@ def _walk(
 
 
 def _steps(element: Element, order: ByteOrder) -> list[tuple[str, struct.Struct | None, int]]:
-    codes = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I"}
     prefix = "<" if order == "<" else ">"
     return [
         (
             property.name,
-            struct.Struct(prefix + codes[TYPES[property.length_type]]) if property.length_type else None,
+            struct.Struct(prefix + STRUCT_CODES[TYPES[property.length_type]]) if property.length_type else None,
             property.dtype(order).itemsize,
         )
         for property in element.properties
@@ -359,26 +356,6 @@ def _write_new(cloud: PointCloud, file: BinaryIO, comment: str | None) -> None:
         vertices[name] = cloud.xyz[:, axis]
     element = plyfile.PlyElement.describe(vertices, "vertex")
     plyfile.PlyData([element], byte_order="<", comments=[comment] if comment else []).write(file)
-
-
-def _convert(path: Path, encoding: str) -> None:
-    """Rewrites our own, already checked file in another encoding; plyfile reads and writes it."""
-    try:
-        with np.errstate(all="ignore"):  # text beyond its type is infinite, here as in _read_ascii
-            data = plyfile.PlyData.read(str(path), mmap=False)
-        if encoding == "binary_big_endian" and any(_mixes_lists(element) for element in data):
-            # plyfile 1.1 writes the numbers of such rows in the machine's own byte order.
-            raise ParameterError("rows that hold both lists and numbers cannot be converted to binary_big_endian")
-        data.text = encoding == "ascii"
-        data.byte_order = ENCODINGS[encoding]
-        data.write(str(path))
-    except (plyfile.PlyParseError, ValueError, OverflowError) as error:
-        raise MalformedFileError(f"the file cannot be converted to {encoding}: {error}") from error
-
-
-def _mixes_lists(element: plyfile.PlyElement) -> bool:
-    lists = [isinstance(property, plyfile.PlyListProperty) for property in element.properties]
-    return any(lists) and not all(lists)
 
 
 def _spelled(property: Property) -> str:

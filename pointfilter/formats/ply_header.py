@@ -100,7 +100,7 @@ def read_header(file: BinaryIO, file_size: int, limits: ReadLimits) -> Header:
             raise LimitExceededError(
                 f"the header is longer than {limits.max_header_bytes} bytes",
                 limit=limits.max_header_bytes,
-                hint="raise max_header_bytes if this is a real file",
+                hint="real headers are far shorter: is this a PLY file?",
             )
         if not line.endswith(b"\n"):
             raise MalformedFileError(f"line {number}: the file ends inside the header")

@@ -13,7 +13,7 @@ from pointfilter.errors import ParameterError
 from pointfilter.pipeline import Radius
 from service.dependencies import AdmittedFolder, ExchangeDep, HouseDep, Ready
 from service.download import FileDownload, content_disposition
-from service.errors import DeadlineError
+from service.errors import DeadlineError, DrainingError
 from service.exchange import Exchange
 from service.house import House
 from service.problems import answers
@@ -106,6 +106,14 @@ async def filter_file(
             f"the result was not there after {house.settings.timeout_seconds:g} s; the work was stopped",
             limit=house.settings.timeout_seconds,
             hint=f"send less, or whoever runs the service can raise {variable('timeout_seconds')}",
+        ) from None
+    except asyncio.CancelledError:
+        task = asyncio.current_task()
+        if not house.draining or task is None:
+            raise
+        task.uncancel()  # the server cancels what outlasts the drain; there is just time to say so
+        raise DrainingError(
+            "this process had to end before the result was there; the work was stopped", hint="send the request again"
         ) from None
     house.telemetry.delivered(delivery)
     exchange.points = delivery.report.points

@@ -71,7 +71,11 @@ def stack(image: str) -> Iterator[tuple[Server, Server, str]]:
         )
     finally:
         subprocess.run(
-            [*command, "down", "--volumes", "--timeout", "40"], cwd=ROOT, env=os.environ | ports, check=True, timeout=120
+            [*command, "down", "--volumes", "--timeout", "40"],
+            cwd=ROOT,
+            env=os.environ | ports,
+            check=True,
+            timeout=120,
         )
 
 

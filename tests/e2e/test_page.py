@@ -1,4 +1,4 @@
-"""The page as a person uses it, in a real browser. Skips where there is no chromium (Debian: apt-get install chromium)."""
+"""The page as a person uses it, in a real browser. Skips without one (Debian: apt-get install chromium)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ from tests.e2e.conftest import NOISY, Server
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
-FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
 
 
 @pytest.fixture(scope="module")

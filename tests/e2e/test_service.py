@@ -67,7 +67,7 @@ def test_the_small_routes_answer(service: Server, path: str) -> None:
 
 def test_sigterm_lets_the_running_request_finish(tmp_path: Path) -> None:
     answers: list[Answer] = []
-    with running_service(tmp_path) as (server, process):
+    with running_service(tmp_path, POINTFILTER_DRAIN_SECONDS="200") as (server, process):
         request = threading.Thread(target=lambda: answers.append(server.post("/filter", NOISY.read_bytes())))
         request.start()
         for _ in range(200):

@@ -1,4 +1,4 @@
-"""The built wheel in an empty environment: it must work without this checkout, without torch and without the web parts."""
+"""The built wheel in an empty environment: no checkout, no torch, no web framework."""
 
 from __future__ import annotations
 

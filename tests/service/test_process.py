@@ -48,7 +48,7 @@ class Running:
     def send(self, method: str, path: str, body: object = None) -> tuple[int, bytes]:
         request = urllib.request.Request(f"http://127.0.0.1:{self.port}{path}", data=body, method=method)  # type: ignore[arg-type]
         try:
-            with urllib.request.urlopen(request, timeout=60) as answer:  # noqa: S310
+            with urllib.request.urlopen(request, timeout=60) as answer:
                 return answer.status, answer.read()
         except urllib.error.HTTPError as error:
             with error:
@@ -166,6 +166,10 @@ def test_a_stop_does_not_wait_for_ever(running: Callable[..., Running], long_wor
     service.process.send_signal(signal.SIGTERM)
     assert service.process.wait(30) == 0
     assert time.monotonic() - started < 20
+    answer = http.client.HTTPResponse(connection)
+    answer.begin()
+    assert (answer.status, json.loads(answer.read())["code"]) == (503, "draining")
+    answer.close()
     connection.close()
     assert list(temp_dir.iterdir()) == []
 

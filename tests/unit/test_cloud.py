@@ -52,7 +52,8 @@ def test_a_cloud_of_arrays_can_be_written(encoding: str, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("before", ENCODINGS)
 @pytest.mark.parametrize("after", ENCODINGS)
-def test_every_value_survives_a_change_of_encoding(before: str, after: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("lists", [False, True], ids=["numbers", "numbers and lists"])
+def test_every_value_survives_a_change_of_encoding(lists: bool, before: str, after: str, tmp_path: Path) -> None:
     layout = [
         Column("x", "double"),
         Column("red", "uchar"),
@@ -60,7 +61,10 @@ def test_every_value_survives_a_change_of_encoding(before: str, after: str, tmp_
         Column("z", "double"),
         Column("w", "short"),
     ]
-    rows = [[0.1 + k, k, 0.25 * k, 1e-7 * k, -k] for k in range(9)]
+    rows: list[list[object]] = [[0.1 + k, k, 0.25 * k, 1e-7 * k, -k] for k in range(9)]
+    if lists:
+        layout.insert(2, Column("views", "short", "uchar"))
+        rows = [[*row[:2], [-k] * (k % 3), *row[2:]] for k, row in enumerate(rows)]
     faces = [[[0, 1, 2]], [[3, 4, 5, 6]]]
     tables = [Table("vertex", layout, rows), Table("face", [Column("vertex_indices", "int", "uchar")], faces)]
     source, target, back = tmp_path / "in.ply", tmp_path / "out.ply", tmp_path / "back.ply"
