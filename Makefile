@@ -11,7 +11,7 @@ export ORT_DISABLE_TELEMETRY := 1
 
 BUILD_INPUTS := pyproject.toml setup.py constraints.txt pointfilter/_native.cpp
 
-.PHONY: help serve test check format dev examples image clean
+.PHONY: help serve test check format dev examples image upgrade clean
 
 help:
 	@echo "make serve     set up .venv and start the service on PORT ($(PORT))"
@@ -21,6 +21,7 @@ help:
 	@echo "make dev       set up .venv-dev: training, export, tests, checks"
 	@echo "make examples  write examples/ anew"
 	@echo "make image     build the container image pointfilter:latest"
+	@echo "make upgrade   renew constraints.txt with the newest versions"
 	@echo "make clean     remove the environments and what builds left"
 
 serve: .venv/ready
@@ -54,7 +55,7 @@ image:
 
 .venv-dev/ready: $(BUILD_INPUTS) | compiler
 	$(PYTHON) -m venv .venv-dev
-	.venv-dev/bin/python $(PIP_INSTALL) --editable '.[service,training,export,dev]'
+	.venv-dev/bin/python $(PIP_INSTALL) --editable '.[service,training,export,benchmarks,dev]'
 	touch $@
 
 .PHONY: compiler
@@ -64,5 +65,14 @@ compiler:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "Python 3.11 or newer is needed; say which with PYTHON=python3.12" >&2; exit 1; }
 
+# Newest versions of everything but torch, then run the tests before committing the new constraints.txt.
+upgrade:
+	$(PYTHON) -m venv .venv-upgrade
+	grep '^torch==' constraints.txt >.venv-upgrade/torch.txt
+	.venv-upgrade/bin/python -m pip install --quiet --constraint .venv-upgrade/torch.txt \
+	  --editable '.[service,training,export,benchmarks,dev]'
+	{ grep '^#' constraints.txt; .venv-upgrade/bin/pip freeze --exclude-editable | sed 's/+cpu$$//'; } >.venv-upgrade/new.txt
+	mv .venv-upgrade/new.txt constraints.txt
+
 clean:
-	rm -rf .venv .venv-dev build dist *.egg-info pointfilter/*.so
+	rm -rf .venv .venv-dev .venv-upgrade build dist *.egg-info pointfilter/*.so
