@@ -29,8 +29,7 @@ DEFAULT_ITERATIONS = 2
 MAX_ITERATIONS = 100
 MIN_NEIGHBOURS = 4  # fewer, the centre included, say nothing about a surface: the point stays where it is
 ROWS_PER_BATCH = 2_048  # points a batch, all its patches together; measured: docs/adr/0005-one-thread-a-call.md
-
-
+BATCHES_PER_TASK = 8  # batches that a worker cuts in one go, so that workers seldom meet at the interpreter's lock
 CENTRES_PER_COUNT = 1024  # centres whose neighbours are counted between two looks at `cancelled`
 
 
@@ -95,7 +94,7 @@ def filter_points(
     radius: absolute, in the unit of the points; by default 5 % of the bounding-box diagonal. It is taken once, from the
     input, and kept for all iterations. patch_points: N, what the network was trained with. seed: of the downsampling.
     threads: how many batches are evaluated at once; the result does not depend on it. progress(done, total) is called
-    from this thread, in units of points times iterations. cancelled() is asked between batches.
+    from this thread, in units of points times iterations. cancelled() is asked between batches, from any thread.
 
     Raises TooFewPointsError, DegenerateCloudError, ParameterError, FilteringCancelledError.
     """
@@ -156,11 +155,20 @@ def _one_pass(
     centres, centre_ids = points[rows], ids[rows]
     result = points.copy()
 
+    def check() -> None:
+        if cancelled is not None and cancelled():
+            raise FilteringCancelledError("filtering was cancelled")
+
     def evaluate(chosen: NDArray[np.int64], length: int) -> int:
         with timings.measure("patches"):
             patches = index.patches(centres[chosen], centre_ids[chosen], length, key)
+        size = _patches_per_batch(length)
+        parts = []
         with timings.measure("infer"):
-            displacements = predict(patches.points).astype(np.float64)
+            for start in range(0, len(chosen), size):
+                check()
+                parts.append(predict(patches.points[start : start + size]))
+        displacements = np.concatenate(parts).astype(np.float64)
         # r R⁻¹ f(.): R is a rotation, so its inverse is its transpose; rows of `frames` are the axes.
         steps = np.einsum("bi,bij->bj", displacements, patches.frames) * index.radius
         steps[patches.counts < MIN_NEIGHBOURS] = 0.0
@@ -168,11 +176,11 @@ def _one_pass(
         return len(chosen)
 
     with timings.measure("patches"):
-        counts = _count(index, centres, threads, cancelled)
+        counts = _count(index, centres, threads, check)
 
     def tasks() -> Iterator[tuple[NDArray[np.int64], int]]:
         for length, positions in length_buckets(counts, patch_points):
-            size = max(1, ROWS_PER_BATCH // length)
+            size = BATCHES_PER_TASK * _patches_per_batch(length)
             for start in range(0, len(positions), size):
                 yield positions[start : start + size], length
 
@@ -191,17 +199,18 @@ def _one_pass(
                 finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 done += sum(future.result() for future in finished)
                 report(done)
-                if cancelled is not None and cancelled():
-                    raise FilteringCancelledError("filtering was cancelled")
+                check()
         finally:
             for future in waiting:
                 future.cancel()
     return result
 
 
-def _count(
-    index: NeighbourIndex, centres: Float64, threads: int, cancelled: Callable[[], bool] | None
-) -> NDArray[np.int64]:
+def _patches_per_batch(length: int) -> int:
+    return max(1, ROWS_PER_BATCH // length)
+
+
+def _count(index: NeighbourIndex, centres: Float64, threads: int, check: Callable[[], None]) -> NDArray[np.int64]:
     """Neighbours of every centre. Balls that hold most of the cloud make this slow, so it can be cancelled too."""
     counts = [np.empty(0, dtype=np.int64)]
     with ThreadPoolExecutor(threads, thread_name_prefix="count") as pool:
@@ -209,6 +218,5 @@ def _count(
         for first in range(0, len(starts), threads):
             parts = [centres[start : start + CENTRES_PER_COUNT] for start in starts[first : first + threads]]
             counts += pool.map(index.count, parts)
-            if cancelled is not None and cancelled():
-                raise FilteringCancelledError("filtering was cancelled")
+            check()
     return np.concatenate(counts)
