@@ -62,6 +62,8 @@ image:
 compiler:
 	@command -v c++ >/dev/null || command -v g++ >/dev/null || command -v clang++ >/dev/null || { \
 	  echo "a C++17 compiler is needed to build pointfilter/_native.cpp (Debian: apt-get install g++)" >&2; exit 1; }
+	@$(PYTHON) -c 'import os, sys, sysconfig as s; sys.exit(not os.path.exists(s.get_path("include") + "/Python.h"))' || { \
+	  echo "Python.h is missing (Debian: apt-get install python3-dev)" >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	  echo "Python 3.11 or newer is needed; say which with PYTHON=python3.12" >&2; exit 1; }
 

@@ -20,7 +20,7 @@ from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.evaluation import read_mesh
 from pointfilter.metrics import point_to_surface
-from pointfilter.models import find_model
+from pointfilter.models import open_model
 from pointfilter.noise import bounding_box_diagonal
 from pointfilter.pipeline import filter_cloud
 
@@ -39,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--model")
     options = parser.parse_args(arguments)
     noisy = PointCloud.read(options.noisy)
-    filtered, _ = filter_cloud(noisy, Engine(find_model(options.model)), iterations=options.iterations)
+    filtered, _ = filter_cloud(noisy, Engine(open_model(options.model)), iterations=options.iterations)
     vertices, faces = read_mesh(options.mesh)
     diagonal = bounding_box_diagonal(vertices)
     errors = [100 * point_to_surface(cloud.xyz, vertices, faces) / diagonal for cloud in (noisy, filtered)]

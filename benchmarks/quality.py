@@ -27,7 +27,7 @@ from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.evaluation import read_mesh
 from pointfilter.metrics import chamfer_distance, closest_on_surface, normalised, point_to_surface
-from pointfilter.models import find_model, load_bundle
+from pointfilter.models import open_model
 from pointfilter.pipeline import filter_cloud
 
 Float64 = NDArray[np.float64]
@@ -77,11 +77,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the table there as well")
     options = parser.parse_args(arguments)
-    if options.data is None or not Path(options.data).is_dir():
-        print("no benchmark data: say where with --data DIR or POINTFILTER_BENCHMARK_DATA", file=sys.stderr)
+    if options.data is None or not Path(options.data, "mesh").is_dir():
+        print(
+            "no benchmark data: name a folder with clouds and mesh/ by --data or POINTFILTER_BENCHMARK_DATA",
+            file=sys.stderr,
+        )
         return 2
-    by_path = options.model and Path(options.model, "model.json").is_file()
-    engine = Engine(load_bundle(Path(options.model)) if by_path else find_model(options.model))
+    engine = Engine(open_model(options.model))
     subjects = load_subjects(Path(options.data))
     table = []
     for level in options.noise:

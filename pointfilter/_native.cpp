@@ -149,9 +149,12 @@ class Selection {
     keys_.resize(count);
     const uint64_t base = mix(key ^ mix(centre_id + 0x9e3779b97f4a7c15ULL));
     uint32_t bins[kKeyBins] = {};
+    uint64_t copies = 0;  // points at the same place share an id and follow one another: number them
     for (size_t k = 0; k < count; ++k) {
       const uint64_t id = ids[members[k]];
-      const uint64_t value = id == centre_id ? 0 : mix(base + id * 0x9e3779b97f4a7c15ULL);
+      copies = k > 0 && id == ids[members[k - 1]] ? copies + 1 : 0;
+      const uint64_t hashed = mix(base + id * 0x9e3779b97f4a7c15ULL + copies * 0xd1b54a32d192ed03ULL);
+      const uint64_t value = id == centre_id && copies == 0 ? 0 : hashed;
       keys_[k] = value;
       ++bins[value >> 56];
     }
@@ -164,7 +167,7 @@ class Selection {
     const size_t rank = wanted - below - 1;
     std::nth_element(border_.begin(), border_.begin() + static_cast<std::ptrdiff_t>(rank), border_.end());
     const uint64_t threshold = border_[rank];
-    size_t equal = 0;  // equal keys are equal ids, that is, points at the same place: take the first ones
+    size_t equal = 0;  // equal keys are next to impossible: take the first ones
     for (size_t k = 0; k < count; ++k) equal += keys_[k] < threshold;
     equal = wanted - equal;
     size_t kept = 0;
@@ -257,8 +260,8 @@ void pca_frame(const std::vector<double>& offsets, double* frame) {
 }
 
 // ---------------------------------------------------------------------------------------------------------------
-// What Python calls. Shapes and dtypes are patches.py's business; here every buffer's length is checked, so that a
-// mistake there is an exception and never a stray read.
+// What Python calls. Shapes and dtypes are patches.py's business; here the lengths of all buffers are checked against
+// each other. The order of the cells is taken on trust: NeighbourIndex is the only one who makes an index.
 
 struct Buffer {
   Py_buffer view{};

@@ -28,7 +28,7 @@ from pointfilter.engine import DEVICES, Engine, available_cpus
 from pointfilter.evaluation import evaluate
 from pointfilter.formats import FORMATS, format_of
 from pointfilter.formats.ply_header import ENCODINGS
-from pointfilter.models import DEFAULT_MODEL, ModelBundle, available_models, find_model, load_bundle
+from pointfilter.models import DEFAULT_MODEL, available_models, find_model, load_bundle, open_model
 from pointfilter.noise import bounding_box_diagonal
 from pointfilter.pipeline import Radius, Report, filter_cloud
 
@@ -111,7 +111,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _filter(options: argparse.Namespace) -> int:
     radius = Radius.parse(options.radius) if options.radius is not None else None
-    engine = Engine(_bundle(options.model), options.device, options.threads)
+    engine = Engine(open_model(options.model, model_folders()), options.device, options.threads)
     to_stdout = options.output == "-"
     for source, target in _pairs(options.input, options.output):
         with _on_disk(source) as path, _collected(target) as result:
@@ -127,13 +127,6 @@ def _filter(options: argparse.Namespace) -> int:
         elif not options.quiet:
             print(_summary(source, target, report), file=sys.stderr)
     return 0
-
-
-def _bundle(name: str | None) -> ModelBundle:
-    """A model by name, or by folder where the name is a path."""
-    if name is not None and (os.sep in name or Path(name, "model.json").is_file()):
-        return load_bundle(Path(name))
-    return find_model(name, model_folders())
 
 
 def model_folders() -> list[Path]:
@@ -265,7 +258,12 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def _models(options: argparse.Namespace) -> int:
-    bundles = [load_bundle(folder) for folder in available_models(model_folders()).values()]
+    bundles = []
+    for folder in available_models(model_folders()).values():
+        try:
+            bundles.append(load_bundle(folder))
+        except errors.ModelError as error:
+            print(f"left out: {error}", file=sys.stderr)
     if options.json:
         print(json.dumps([bundle.summary() for bundle in bundles]))
         return 0

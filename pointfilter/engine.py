@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from pathlib import Path
 
@@ -44,8 +45,11 @@ class Engine:
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
         options.log_severity_level = 3
+        weights = bundle.onnx.read_bytes()  # what is run is what the bundle's sha256 stands for
+        if hashlib.sha256(weights).hexdigest() != bundle.sha256:
+            raise InvalidModelError(f"model.onnx of {bundle.name!r} changed after it was checked")
         try:
-            self._session = onnxruntime.InferenceSession(bundle.onnx, options, providers=[provider])
+            self._session = onnxruntime.InferenceSession(weights, options, providers=[provider])
         except Exception as error:  # onnxruntime's own tree differs between versions and providers
             raise InvalidModelError(f"onnxruntime cannot load model {bundle.name!r}: {_first_line(error)}") from error
         self.provider: str = self._session.get_providers()[0]

@@ -15,7 +15,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pointfilter.errors import DegenerateCloudError, FilteringCancelledError, ParameterError, TooFewPointsError
+from pointfilter.errors import (
+    DegenerateCloudError,
+    FilteringCancelledError,
+    InvalidModelError,
+    ParameterError,
+    TooFewPointsError,
+)
 from pointfilter.noise import bounding_box_diagonal
 from pointfilter.patches import NeighbourIndex, length_buckets, sampling_key, stable_ids
 
@@ -27,6 +33,7 @@ Predict = Callable[[Float32], Float32]
 DEFAULT_RADIUS = 0.05  # of the bounding-box diagonal (§3.2)
 DEFAULT_ITERATIONS = 2
 MAX_ITERATIONS = 100
+SMALLEST_RADIUS = 1e-150  # its square is still a number
 MIN_NEIGHBOURS = 4  # fewer, the centre included, say nothing about a surface: the point stays where it is
 ROWS_PER_BATCH = 2_048  # points a batch, all its patches together; measured: docs/adr/0005-one-thread-a-call.md
 BATCHES_PER_TASK = 8  # batches that a worker cuts in one go, so that workers seldom meet at the interpreter's lock
@@ -58,19 +65,30 @@ class Timings:
 def resolve_radius(points: Float64, radius: float | None, fraction: float = DEFAULT_RADIUS) -> float:
     """The absolute radius: the given one, or `fraction` of the bounding-box diagonal of the (n, 3) points.
 
-    Raises ParameterError for a radius that is not a finite number above 0, DegenerateCloudError when the points have no
-    extent to take a fraction of, or one beyond double precision.
+    Raises ParameterError for a radius that is no finite number above 0 or is larger than the diagonal,
+    DegenerateCloudError when the points have no extent to take a fraction of, or one beyond double precision.
     """
     diagonal = bounding_box_diagonal(points)
     if not np.isfinite(diagonal):  # squares of such distances would overflow
         raise DegenerateCloudError("the extent of the cloud is beyond double precision", hint="remove the stray points")
     if radius is not None:
-        if not (np.isfinite(radius) and radius > 0):
-            raise ParameterError("radius must be a finite number above 0", limit=0, actual=radius)
+        if not (np.isfinite(radius) and radius >= SMALLEST_RADIUS):
+            raise ParameterError(
+                f"radius must be a finite number above 0 (at least {SMALLEST_RADIUS:g}), got {radius:g}",
+                limit=SMALLEST_RADIUS,
+                actual=radius,
+            )
+        if 0 < diagonal < radius:
+            raise ParameterError(
+                f"radius {radius:g} is larger than the cloud, whose bounding box has a diagonal of {diagonal:g}",
+                limit=diagonal,
+                actual=radius,
+                hint="it is in the unit of the file; 5% takes a share of the diagonal",
+            )
         return float(radius)
-    if not diagonal > 0:
+    if not diagonal * fraction >= SMALLEST_RADIUS:
         raise DegenerateCloudError(
-            "all points are at the same place, so there is no extent to take a radius from",
+            "all points are at the same place, as far as numbers can tell: there is no extent to take a radius from",
             hint="pass radius in the units of the file",
         )
     return diagonal * fraction
@@ -169,9 +187,11 @@ def _one_pass(
                 check()
                 parts.append(predict(patches.points[start : start + size]))
         displacements = np.concatenate(parts).astype(np.float64)
+        if displacements.shape != (len(chosen), 3) or not np.isfinite(displacements).all():
+            raise InvalidModelError("the network answered with something else than finite displacements")
         # r R⁻¹ f(.): R is a rotation, so its inverse is its transpose; rows of `frames` are the axes.
         steps = np.einsum("bi,bij->bj", displacements, patches.frames) * index.radius
-        steps[patches.counts < MIN_NEIGHBOURS] = 0.0
+        steps[(patches.counts < MIN_NEIGHBOURS) | ~patches.points.any(axis=(1, 2))] = 0.0
         result[rows[chosen]] = centres[chosen] + steps
         return len(chosen)
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +21,9 @@ SCHEMA = 1
 FRAME = "pca-mean-sign"  # the frame's sign rule that the weights were trained with (patches.py)
 BUNDLES = Path(__file__).parent / "bundles"
 DEFAULT_MODEL = "pointfilter-fast"
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}")
+NAME_RULE = "up to 100 letters, digits and . _ + -, the first a letter or digit"
 
 _FIELDS: dict[str, type | tuple[type, ...]] = {
     "schema": int, "name": str, "version": str, "sha256": str, "opset": int, "frame": str, "patch_points": int,
@@ -80,6 +85,10 @@ def load_bundle(folder: Path) -> ModelBundle:
             raise InvalidModelError(
                 f"model.json of {folder.name!r}: {name!r} must be from {low} to {high}, not {described[name]}"
             )
+    described["name"] = folder.resolve().name  # a bundle is found by its folder's name, so that is its name
+    for name in ("name", "version"):
+        if not NAME.fullmatch(described[name]):
+            raise InvalidModelError(f"{name} {described[name]!r} of model {folder.name!r} must be {NAME_RULE}")
     if described["frame"] != FRAME:
         raise InvalidModelError(f"model {folder.name!r} was trained with frames {described['frame']!r}, not {FRAME!r}")
     if described["sha256"] != digest:
@@ -97,6 +106,16 @@ def available_models(folders: Sequence[Path] = ()) -> dict[str, Path]:
                 if (path / "model.json").is_file():
                     found.setdefault(path.name, path)
     return found
+
+
+def open_model(name: str | None = None, folders: Sequence[Path] = ()) -> ModelBundle:
+    """A model by name, or by folder where the name is a path: for people at a prompt, not for requests from outside.
+
+    Raises ModelNotFoundError, InvalidModelError.
+    """
+    if name is not None and (os.sep in name or Path(name, "model.json").is_file()):
+        return load_bundle(Path(name))
+    return find_model(name, folders)
 
 
 def find_model(name: str | None = None, folders: Sequence[Path] = ()) -> ModelBundle:

@@ -46,6 +46,7 @@ class Engines:
         """
         with self._lock:
             if name not in self._loaded:
+                self._bundles.pop(name, None)  # the folder may hold a newer export by now
                 engine = Engine(self._bundle(name), self._device, self._threads)
                 engine.warm_up()
                 self._loaded[name] = engine

@@ -31,7 +31,11 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the run (default: runs/PRESET)")
     parser.add_argument("--preset", choices=preset_names(), default="default", help="default: %(default)s")
-    parser.add_argument("--resume", action="store_true", help="go on from the folder's checkpoint, exactly")
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on from the folder's checkpoint, exactly, with the settings that it holds",
+    )
     parser.add_argument("--init", type=Path, help="start from the weights of this checkpoint.pt")
     parser.add_argument("--until", type=int, metavar="STEP", help="stop after this step, with a checkpoint")
     parser.add_argument("--seed", type=int, default=None, help="of weights, shapes, noise and batches (default: 0)")

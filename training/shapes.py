@@ -46,9 +46,12 @@ class Mesh:
         return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
-def random_shape(seed: int) -> Mesh:
-    """The shape of this seed: six in ten are CAD solids, two rounded solids, two smooth bodies."""
-    rng = np.random.default_rng([seed, 0x5AFE])
+def random_shape(seed: int, family: int = 0) -> Mesh:
+    """The shape of this seed: six in ten are CAD solids, two rounded solids, two smooth bodies.
+
+    Families share no shape: one is for training, another for validation.
+    """
+    rng = np.random.default_rng([seed, 0x5AFE, family] if family else [seed, 0x5AFE])
     pick = rng.random()
     build = _solid if pick < 0.6 else _rounded_solid if pick < 0.8 else _smooth_body
     for _ in range(20):

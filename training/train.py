@@ -103,6 +103,8 @@ class Run:
         self.step = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
+        self.recent: list[float] = []
+        """Losses since the last row of the history."""
         self.source: dict[str, str] = {}
         """Where the user's own data is: "meshes" or "clouds" and the folder. Empty for procedural shapes."""
         if resume:
@@ -134,7 +136,7 @@ class Run:
         self.optimizer.load_state_dict(state["optimizer"])
         self.scheduler.load_state_dict(state["scheduler"])
         self.step, self.seconds, self.history = state["step"], state["seconds"], state["history"]
-        self.source = state.get("source", {})
+        self.source, self.recent = state.get("source", {}), state.get("recent", [])
 
     def save(self) -> None:
         """Writes the checkpoint so that a kill at any moment leaves the old one or the new one, whole."""
@@ -144,6 +146,7 @@ class Run:
             "step": self.step,
             "seconds": self.seconds,
             "history": self.history,
+            "recent": self.recent,
             "source": self.source,
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
@@ -167,11 +170,10 @@ class Run:
     def train(self, clouds: list[TrainingCloud], until: int | None = None) -> None:
         """Trains to the last step, or stops (with a checkpoint) after step `until`."""
         settings = self.settings
-        last = min(until or settings.steps, settings.steps)
+        last = settings.steps if until is None else min(until, settings.steps)
         bfloat16 = _use_bfloat16(settings.precision)
         validation = [validation_cloud(number, settings.data) for number in range(settings.validation_clouds)]
         self.network.train()
-        recent: list[float] = []
         started = time.perf_counter()
         spent = self.seconds
         progress = tqdm(initial=self.step, total=settings.steps, unit="batch", smoothing=0.05)
@@ -187,7 +189,7 @@ class Run:
             self.average.update_parameters(self.network)
             self.step += 1
             self.seconds = spent + time.perf_counter() - started
-            recent.append(loss.item())
+            self.recent.append(loss.item())
             progress.update()
             if self.step % settings.validate_every == 0 or self.step == settings.steps:
                 row: dict[str, float] = {
@@ -196,10 +198,10 @@ class Run:
                     "hours": round(self.seconds / 3600, 4),
                     "patches_per_second": round(self.step * settings.data.batch / self.seconds, 1),
                     "learning_rate": float(self.scheduler.get_last_lr()[0]),
-                    "loss": float(np.mean(recent)),
+                    "loss": float(np.mean(self.recent)),
                     **self._validate(validation),
                 }
-                recent.clear()
+                self.recent.clear()
                 self.history.append(row)
                 progress.write("  ".join(f"{name} {value:.6g}" for name, value in row.items()))
             if self.step % settings.checkpoint_every == 0:
@@ -221,16 +223,14 @@ class Run:
             loss = filtering_loss(displacements, batch.clean, batch.normals, batch.present, settings.loss).mean().item()
         distances = []
         for cloud in clouds:
-            filtered = cloud.points
-            row = [chamfer_distance(cloud.clean, filtered)]
-            for iteration in range(2):
+            row = [chamfer_distance(cloud.clean, cloud.points)]
+            for iterations in (1, 2):
                 filtered = filter_points(
-                    filtered,
+                    cloud.points,
                     predictor(network),
                     radius=cloud.index.radius,
-                    iterations=1,
+                    iterations=iterations,
                     patch_points=settings.data.patch_points,
-                    seed=iteration,
                 )
                 row.append(chamfer_distance(cloud.clean, filtered))
             distances.append(row)
@@ -270,6 +270,8 @@ def start(
     if resume:
         saved = torch.load(folder / "checkpoint.pt", weights_only=True)
         settings = TrainingSettings.from_dict(saved["settings"])
+    elif (folder / "checkpoint.pt").exists():
+        raise FileExistsError(f"{folder} holds a run already: go on with --resume, or choose another folder with --out")
     run = Run(folder, settings, resume, init)
     if meshes or clouds or not resume:
         run.source = {name: str(path.absolute()) for name, path in (("meshes", meshes), ("clouds", clouds)) if path}

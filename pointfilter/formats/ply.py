@@ -23,13 +23,14 @@ import plyfile
 from numpy.typing import NDArray
 
 from pointfilter.cloud import PointCloud
-from pointfilter.errors import MalformedFileError, ParameterError
+from pointfilter.errors import LimitExceededError, MalformedFileError, ParameterError
 from pointfilter.formats.ply_convert import STRUCT_CODES, convert
 from pointfilter.formats.ply_header import ENCODINGS, TYPES, ByteOrder, Element, Header, Property, read_header, shown
 from pointfilter.limits import ReadLimits
 
 Float64 = NDArray[np.float64]
 AXES = ("x", "y", "z")
+MAX_LIST_ROW_BYTES = 1 << 20  # of ascii: a row is held as tokens, at 40 times its bytes
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def write(cloud: PointCloud, path: Path, encoding: str = "same", comment: str | 
         raise ParameterError(f"format must be one of same, {', '.join(ENCODINGS)}, got {encoding!r}", actual=encoding)
     if comment is not None and not (comment.isascii() and comment.isprintable()):
         raise ValueError("a comment must be one line of printable ASCII")
-    partial = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.partial")
+    partial = path.with_name(f".{secrets.token_hex(8)}.partial")
     try:
         with partial.open("xb") as file:  # not a private file of tempfile's: the result is the user's ordinary one
             if isinstance(cloud.source, PlySource):
@@ -208,6 +209,13 @@ def _read_ascii(header: Header, data: mmap.mmap) -> PointCloud:
         for _ in range(element.count):
             end = data.find(b"\n", position)
             end = len(data) if end < 0 else end
+            if fields is None and end - position > MAX_LIST_ROW_BYTES:
+                raise LimitExceededError(
+                    f"line {number + 1}: a row with lists has {end - position} bytes, more than {MAX_LIST_ROW_BYTES}",
+                    limit=MAX_LIST_ROW_BYTES,
+                    actual=end - position,
+                    hint="write the file in a binary encoding",
+                )
             # A row without lists is never taken further apart than it may be: tokens cost 40 times their bytes.
             tokens = data[position:end].split(None, -1 if fields is None else len(element.properties))
             number += 1

@@ -37,7 +37,10 @@ def convert(path: Path, encoding: str) -> None:
         with path.open("rb") as source, partial.open("xb") as target:
             header = read_header(source, os.fstat(source.fileno()).st_size, ReadLimits(max_header_bytes=2**31))
             format_line = b"format " + encoding.encode() + b" 1.0"
-            target.write(re.sub(rb"(?m)^[ \t]*format\b[^\r\n]*", format_line, header.raw, count=1))
+            raw, replaced = re.subn(rb"(?m)^[ \t]*format\b[^\r\n]*", format_line, header.raw, count=1)
+            if not replaced:
+                raise MalformedFileError("the format line starts with a character that is no blank")
+            target.write(raw)
             target.write(b"end_header" + header.ending)
             for element in header.elements:
                 try:
@@ -54,7 +57,7 @@ def convert(path: Path, encoding: str) -> None:
 def _convert_rows(source: BinaryIO, target: BinaryIO, element: Element, header: Header, encoding: str) -> None:
     order = ENCODINGS[encoding]
     ascii = encoding == "ascii"
-    if element.has_lists or not element.properties:
+    if element.has_lists:
         read = _rows_of_text(source, element) if header.encoding == "ascii" else _rows(source, element, header.order)
         for row in read:
             target.write(_text(element, row, header.ending) if ascii else _packed(element, row, order))

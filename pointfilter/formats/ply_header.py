@@ -32,10 +32,6 @@ class Property:
     def dtype(self, order: ByteOrder) -> np.dtype[Any]:
         return np.dtype(TYPES[self.type]).newbyteorder(order)
 
-    def length_dtype(self, order: ByteOrder) -> np.dtype[Any]:
-        assert self.length_type is not None
-        return np.dtype(TYPES[self.length_type]).newbyteorder(order)
-
 
 @dataclass(frozen=True)
 class Element:
@@ -186,6 +182,9 @@ class _Parser:
 
 
 def _check(header: Header, file_size: int, limits: ReadLimits) -> None:
+    for element in header.elements:
+        if element.count and not element.properties:  # rows of nothing: any number of them would fit any file
+            raise MalformedFileError(f"element {shown(element.name)} has {element.count} rows and no properties")
     vertex = next((element for element in header.elements if element.name == "vertex"), None)
     if vertex is None:
         raise MissingCoordinatesError("the file has no vertex element")

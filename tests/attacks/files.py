@@ -130,7 +130,7 @@ attack(
 attack(
     "elements that cost nothing",
     header("element vertex 0", *XYZ, "element e 999999999", encoding="binary_big_endian"),
-    TooFew,
+    Malformed,
 )
 attack("ascii elements that cost nothing", header("element vertex 0", *XYZ, "element e 999999999"), Malformed)
 attack(
@@ -143,7 +143,7 @@ attack(
 
 attack("no elements", header(), Missing)
 attack("no vertices", header("element face 0", "property list uchar int vertex_indices"), Missing)
-attack("vertices without properties", header("element vertex 3") + b"\n\n\n", Missing)
+attack("vertices without properties", header("element vertex 3") + b"\n\n\n", Malformed)
 attack("no z", ply_bytes("ascii", [(1.0, 2.0)], ["float x", "float y"]), Missing)
 attack("capital letters", ply_bytes("ascii", [(1.0, 2.0, 3.0)], ["float X", "float Y", "float Z"]), Missing)
 attack("integers", ply_bytes("ascii", [(1, 2, 3)], ["int x", "int y", "int z"]), Missing)
@@ -196,6 +196,18 @@ for _row in (
     b"1 2 --3",
 ):
     attack(f"ascii row {_row.decode('latin-1')!a}", GOOD_ASCII.replace(b"0.0 0.0 0.0", _row), Malformed)
+attack(
+    "rows of nothing",
+    ply_bytes("binary_little_endian", [(1.0, 2.0, 3.0)] * 5).replace(
+        b"end_header", b"element nothing 100000000000000000\nend_header"
+    ),
+    Malformed,
+)
+attack(
+    "a list of a million values",
+    header("element vertex 1", *XYZ, "property list uint uchar views") + b"1 2 3 1000000" + b" 0" * 1_000_000 + b"\n",
+    Limit,
+)
 attack("a million values in a row", GOOD_ASCII.replace(b"0.0 0.0 0.0", b"1 " * 10_000_000), Malformed)
 attack("rows without an end", sparse(header("element vertex 9", *XYZ), GIGABYTE // 8), Malformed)
 attack("too few rows", GOOD_ASCII[: GOOD_ASCII.rindex(b"\n", 0, -1) + 1], Malformed)

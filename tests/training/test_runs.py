@@ -30,6 +30,8 @@ def assert_same(a: Run, b: Run) -> None:
     assert a.step == b.step
     assert str(a.optimizer.state_dict()) == str(b.optimizer.state_dict())
     assert a.scheduler.state_dict() == b.scheduler.state_dict()
+    assert a.recent == b.recent
+    assert [row["loss"] for row in a.history] == [row["loss"] for row in b.history]
 
 
 @pytest.fixture
@@ -71,6 +73,13 @@ def test_a_run_that_was_killed_goes_on_from_its_checkpoint_exactly(
     assert second.step == 4
     second.train(clouds)
     assert_same(straight, second)
+
+
+def test_a_run_is_not_started_over_by_mistake(tmp_path: Path, tiny: TrainingSettings) -> None:
+    run = start(tmp_path, tiny, until=2)
+    with pytest.raises(FileExistsError, match="--resume"):
+        start(tmp_path, tiny)
+    assert start(tmp_path, tiny, resume=True, until=2).step == run.step
 
 
 def test_resuming_takes_the_settings_from_the_checkpoint(tmp_path: Path, tiny: TrainingSettings) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pointfilter import PointCloud, __version__, cli
+from pointfilter import PointCloud, __version__, cli, models
 from pointfilter.errors import FilteringCancelledError, PointfilterError
 from tests.ply_files import ply_bytes
 
@@ -18,13 +18,10 @@ Capture = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(autouse=True)
-def models(bundle_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def tiny_is_the_default(bundle_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The tiny bundle is the default model here, whatever is shipped."""
     monkeypatch.setenv("POINTFILTER_MODEL_DIR", str(bundle_folder.parent))
-    monkeypatch.setattr(cli, "find_model", lambda name=None, folders=(): real_find_model(name or "tiny", folders))
-
-
-real_find_model = cli.find_model
+    monkeypatch.setattr(models, "DEFAULT_MODEL", "tiny")
 
 
 def run(*arguments: object) -> int:
@@ -323,7 +320,7 @@ def test_doctor(capsys: Capture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     assert found["first_inference_ms"] > 0
     assert run("doctor") == 0
     assert "onnxruntime" in capsys.readouterr().out
-    monkeypatch.setattr(cli, "find_model", lambda name=None, folders=(): real_find_model("none of these", folders))
+    monkeypatch.setattr(models, "DEFAULT_MODEL", "none of these")
     assert "no model" in refused(capsys, 4, "doctor")
 
 

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from pointfilter import filtering
-from pointfilter.errors import DegenerateCloudError, FilteringCancelledError, ParameterError, TooFewPointsError
+from pointfilter.errors import (
+    DegenerateCloudError,
+    FilteringCancelledError,
+    InvalidModelError,
+    ParameterError,
+    TooFewPointsError,
+)
 from pointfilter.filtering import MIN_NEIGHBOURS, Timings, filter_points, resolve_radius
 from tests.clouds import pooled
 
@@ -56,8 +62,9 @@ def test_points_with_too_few_neighbours_stay_put() -> None:
 
 def test_enough_neighbours_are_enough() -> None:
     points = np.random.default_rng(0).uniform(size=(MIN_NEIGHBOURS, 3))
-    filtered = filter_points(points, upwards, radius=10.0, iterations=1)
-    np.testing.assert_allclose(np.linalg.norm(filtered - points, axis=1), 5.0, rtol=1e-6)
+    radius = 0.99 * float(np.linalg.norm(np.ptp(points, axis=0)))  # everybody is everybody's neighbour
+    filtered = filter_points(points, upwards, radius=radius, iterations=1)
+    np.testing.assert_allclose(np.linalg.norm(filtered - points, axis=1), radius / 2, rtol=1e-6)
 
 
 def test_the_input_is_left_alone(noisy_crease: np.ndarray) -> None:
@@ -259,3 +266,28 @@ def test_timings_are_added_up_by_stage(noisy_crease: np.ndarray) -> None:
     assert timings.infer >= 0.02
     assert timings.index > 0
     assert timings.patches > 0
+
+
+# --- radii that make no sense ---
+
+
+@pytest.mark.parametrize("radius", [1e-200, 5e-324, 1e6, 1e308])
+def test_a_radius_far_from_the_cloud_s_size(radius: float, noisy_crease: np.ndarray) -> None:
+    with pytest.raises(ParameterError, match="radius"):
+        filter_points(noisy_crease, pooled, radius=radius)
+
+
+def test_a_cloud_too_small_to_compute_with(noisy_crease: np.ndarray) -> None:
+    with pytest.raises(DegenerateCloudError, match="same place"):
+        filter_points(noisy_crease * 1e-162, pooled)
+
+
+@pytest.mark.parametrize("answer", [np.nan, np.inf])
+def test_a_network_that_answers_nonsense_is_an_error(answer: float, noisy_crease: np.ndarray) -> None:
+    with pytest.raises(InvalidModelError, match="finite"):
+        filter_points(noisy_crease, lambda patches: np.full((len(patches), 3), answer, np.float32), radius=0.15)
+
+
+def test_points_at_one_place_say_nothing_about_a_surface() -> None:
+    points = np.repeat([[1.0, 2.0, 3.0]], 1000, axis=0)
+    np.testing.assert_array_equal(filter_points(points, upwards, radius=0.5), points)

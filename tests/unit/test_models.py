@@ -90,6 +90,7 @@ CHANGES: dict[str, Change] = {
             "scores",
         )
     },
+    "a version of two lines": lambda d: d.update(version="1\n2"),
     "points as text": lambda d: d.update(patch_points="64"),
     "no points": lambda d: d.update(patch_points=0),
     "negative points": lambda d: d.update(patch_points=-5),
@@ -99,6 +100,16 @@ CHANGES: dict[str, Change] = {
     "no iterations": lambda d: d.update(iterations=0),
     "iterations for ever": lambda d: d.update(iterations=10**6),
 }
+
+
+def test_the_folder_names_the_model(copy: Path) -> None:
+    assert load_bundle(copy).name == "copy"
+
+
+def test_a_name_that_no_header_could_hold(copy: Path) -> None:
+    odd = copy.rename(copy.with_name("mod\u00e8le copy"))
+    with pytest.raises(InvalidModelError, match="letters, digits"):
+        load_bundle(odd)
 
 
 @pytest.mark.parametrize("name", CHANGES)

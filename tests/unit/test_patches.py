@@ -168,3 +168,13 @@ def test_buffers_that_do_not_fit_are_refused() -> None:
     counts.setflags(write=False)
     with pytest.raises(ValueError, match="read-only"):
         _native.count_neighbours(arrays, points, 1.0, counts)
+
+
+def test_copies_of_the_centre_do_not_crowd_out_its_neighbours() -> None:
+    rng = np.random.default_rng(0)
+    points = np.concatenate([np.zeros((250, 3)), rng.uniform(-0.5, 0.5, (400, 3))])
+    ids = stable_ids(points)
+    patch = NeighbourIndex(points, 1.0, ids).patches(points[:1], ids[:1], 200, key=1).points[0]
+    elsewhere = int(patch.any(axis=1).sum())
+    assert 90 < elsewhere < 160  # 400 of 650 are, and a fair choice of 200 has 123 of them, give or take 7
+    assert not patch.any(axis=1).all()
