@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import re
 import secrets
 import struct
 from array import array
@@ -30,6 +31,7 @@ from pointfilter.limits import ReadLimits
 
 Float64 = NDArray[np.float64]
 AXES = ("x", "y", "z")
+_ELEMENT_LINE = re.compile(rb"^[ \t]*element\b", re.MULTILINE)
 MAX_LIST_ROW_BYTES = 1 << 20  # of ascii: a row is held as tokens, at 40 times its bytes
 
 
@@ -280,9 +282,13 @@ def _columns(tokens: list[bytes], element: Element, fields: list[int] | None, nu
 
 def _write_spliced(cloud: PointCloud, source: PlySource, file: BinaryIO, comment: str | None) -> None:
     header = source.header
-    file.write(header.raw)
+    # Before the first element, where readers look for the comments on the whole file.
+    first = _ELEMENT_LINE.search(header.raw)
+    place = first.start() if first else len(header.raw)
+    file.write(header.raw[:place])
     if comment is not None:
         file.write(b"comment " + comment.encode() + header.ending)
+    file.write(header.raw[place:])
     file.write(source.data[len(header.raw) : source.vertex_start])  # from the end_header line on
     vertices = _spliced_ascii(cloud, source) if header.encoding == "ascii" else _spliced_binary(cloud, source)
     for part in vertices:
