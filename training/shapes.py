@@ -51,6 +51,7 @@ def random_shape(seed: int, family: int = 0) -> Mesh:
 
     Families share no shape: one is for training, another for validation.
     """
+    # Family 0 leaves its number out: that is how the shapes of the first bundle were drawn.
     rng = np.random.default_rng([seed, 0x5AFE, family] if family else [seed, 0x5AFE])
     pick = rng.random()
     build = _solid if pick < 0.6 else _rounded_solid if pick < 0.8 else _smooth_body
