@@ -18,6 +18,7 @@ from pathlib import Path
 
 from export.bundle import ParityError, write_bundle
 from export.checkpoint import load_checkpoint
+from pointfilter.models import AUTO
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -29,7 +30,13 @@ def main(arguments: list[str] | None = None) -> int:
         "--out", type=Path, metavar="FOLDER", help="the bundle; its name names the model (default: bundles/RUN)"
     )
     parser.add_argument("--version", default="0", help="of the weights, kept in model.json (default: %(default)s)")
-    parser.add_argument("--iterations", type=int, default=2, help="default of the bundle (default: %(default)s)")
+    parser.add_argument(
+        "--iterations",
+        type=lambda text: AUTO if text == AUTO else int(text),
+        default=AUTO,
+        metavar="N",
+        help="default of the bundle: a number of passes, or auto (default: %(default)s)",
+    )
     parser.add_argument("--scores", type=Path, metavar="JSON", help="benchmark results to keep in model.json")
     options = parser.parse_args(arguments)
     try:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from export.checkpoint import Loaded
 from export.graph import OPSET, build
 from pointfilter.filtering import MAX_ITERATIONS
-from pointfilter.models import FRAME, NAME, NAME_RULE, SCHEMA, ModelBundle, load_bundle
+from pointfilter.models import AUTO, FRAME, NAME, NAME_RULE, SCHEMA, Auto, ModelBundle, load_bundle
 from pointfilter.patches import NeighbourIndex, stable_ids
 
 PARITY_TOLERANCE = 1e-5  # of the radius
@@ -28,7 +28,7 @@ class ParityError(RuntimeError):
 
 
 def write_bundle(
-    loaded: Loaded, folder: Path, version: str, iterations: int = 2, scores: dict[str, Any] | None = None
+    loaded: Loaded, folder: Path, version: str, iterations: int | Auto = AUTO, scores: dict[str, Any] | None = None
 ) -> tuple[ModelBundle, float]:
     """Writes the bundle folder (its name is the model's name), whole or not at all but for the instant between two
     renames when it takes the place of an older one.
@@ -36,7 +36,7 @@ def write_bundle(
     Returns the bundle as the service will load it, and the parity error. Raises ParityError above PARITY_TOLERANCE,
     ValueError where the folder is there and is no bundle.
     """
-    if not 1 <= iterations <= MAX_ITERATIONS:
+    if iterations != AUTO and not 1 <= iterations <= MAX_ITERATIONS:
         raise ValueError(f"iterations must be from 1 to {MAX_ITERATIONS}, got {iterations}")
     folder = folder.resolve()
     for what, text in (("the folder's name", folder.name), ("the version", version)):

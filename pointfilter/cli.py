@@ -28,7 +28,7 @@ from pointfilter.engine import DEVICES, Engine, available_cpus
 from pointfilter.evaluation import evaluate
 from pointfilter.formats import FORMATS, format_of
 from pointfilter.formats.ply_header import ENCODINGS
-from pointfilter.models import DEFAULT_MODEL, available_models, find_model, load_bundle, open_model
+from pointfilter.models import AUTO, DEFAULT_MODEL, Auto, available_models, find_model, load_bundle, open_model
 from pointfilter.noise import bounding_box_diagonal
 from pointfilter.pipeline import Radius, Report, filter_cloud
 
@@ -69,7 +69,12 @@ def build_parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--model", help=f"a bundle's name or folder (default: {DEFAULT_MODEL}); see `pointfilter models`"
     )
-    command.add_argument("--iterations", type=int, metavar="N", help="passes over the cloud (default: the model's)")
+    command.add_argument(
+        "--iterations",
+        type=_iterations,
+        metavar="N",
+        help="passes over the cloud, or auto for as many as it needs (default: the model's)",
+    )
     command.add_argument("--radius", metavar="R", help="patch radius: 5%% of the diagonal, or 0.02 in the file's unit")
     command.add_argument("--seed", type=int, default=0, metavar="S", help="of the downsampling (default: %(default)s)")
     command.add_argument("--device", default="auto", help=f"auto, {', '.join(DEVICES)} (default: %(default)s)")
@@ -127,6 +132,10 @@ def _filter(options: argparse.Namespace) -> int:
         elif not options.quiet:
             print(_summary(source, target, report), file=sys.stderr)
     return 0
+
+
+def _iterations(text: str) -> int | Auto:
+    return AUTO if text == AUTO else int(text)
 
 
 def model_folders() -> list[Path]:

@@ -22,8 +22,9 @@ from pointfilter.errors import (
     ParameterError,
     TooFewPointsError,
 )
+from pointfilter.models import Auto
 from pointfilter.noise import bounding_box_diagonal
-from pointfilter.patches import NeighbourIndex, length_buckets, sampling_key, stable_ids
+from pointfilter.patches import NeighbourIndex, Patches, length_buckets, sampling_key, stable_ids
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -37,13 +38,20 @@ SMALLEST_RADIUS = 1e-150  # its square is still a number
 MIN_NEIGHBOURS = 4  # fewer, the centre included, say nothing about a surface: the point stays where it is
 ROWS_PER_BATCH = 2_048  # points a batch, all its patches together; measured: docs/adr/0005-one-thread-a-call.md
 BATCHES_PER_TASK = 8  # batches that a worker cuts in one go, so that workers seldom meet at the interpreter's lock
+SAMPLE_POINTS = 2_048  # points by which "auto" judges a cloud: the standard error stays below two hundredths
+PASSES = ((0.0035, 0), (0.1, 2), (0.2, 3))
+"""What "auto" does: (mean displacement of one pass, in units of the radius; passes over a cloud that stays below it).
+
+docs/adr/0007-automatic-iterations.md has the measurements."""
+MOST_PASSES = 4  # above all of them
 CENTRES_PER_COUNT = 1024  # centres whose neighbours are counted between two looks at `cancelled`
 
 
 @dataclass
 class Timings:
-    """Seconds spent, by stage. `patches` and `infer` are summed over the workers."""
+    """Seconds spent, by stage, and passes done. `patches` and `infer` are summed over the workers."""
 
+    passes: int = 0
     index: float = 0.0
     patches: float = 0.0
     infer: float = 0.0
@@ -99,20 +107,23 @@ def filter_points(
     predict: Predict,
     *,
     radius: float | None = None,
-    iterations: int = DEFAULT_ITERATIONS,
+    iterations: int | Auto = DEFAULT_ITERATIONS,
     patch_points: int = 500,
     seed: int = 0,
     threads: int = 1,
     progress: Callable[[int, int], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
+    after_pass: Callable[[int, Float64], None] | None = None,
     timings: Timings | None = None,
 ) -> Float64:
     """Filters (n, 3) finite float64 points; returns the moved points, same shape, same order.
 
     radius: absolute, in the unit of the points; by default 5 % of the bounding-box diagonal. It is taken once, from the
-    input, and kept for all iterations. patch_points: N, what the network was trained with. seed: of the downsampling.
+    input, and kept for all iterations. iterations: a number, or "auto" for as many as the cloud needs (PASSES); a clean
+    one comes back as it was. patch_points: N, what the network was trained with. seed: of the downsampling.
     threads: how many batches are evaluated at once; the result does not depend on it. progress(done, total) is called
     from this thread, in units of points times iterations. cancelled() is asked between batches, from any thread.
+    after_pass(passes, points) sees the cloud as it is after every pass.
 
     Raises TooFewPointsError, DegenerateCloudError, ParameterError, FilteringCancelledError.
     """
@@ -125,7 +136,7 @@ def filter_points(
             limit=MIN_NEIGHBOURS,
             actual=len(points),
         )
-    if not 1 <= iterations <= MAX_ITERATIONS:
+    if not isinstance(iterations, str) and not 1 <= iterations <= MAX_ITERATIONS:
         raise ParameterError(
             f"iterations must be from 1 to {MAX_ITERATIONS}, got {iterations}", limit=MAX_ITERATIONS, actual=iterations
         )
@@ -142,18 +153,52 @@ def filter_points(
     offset = low + (high - low) / 2  # large coordinates must not cost digits
     moved = points - offset
     ids = stable_ids(moved)
-    for iteration in range(iterations):
-        with timings.measure("index"):
-            index = NeighbourIndex(moved, absolute_radius, ids)
+    with timings.measure("index"):
+        index = NeighbourIndex(moved, absolute_radius, ids)
+    if isinstance(iterations, str):
+        with timings.measure("infer"):
+            displacement = expected_displacement(moved, ids, index, predict, patch_points, seed)
+        passes = next((passes for below, passes in PASSES if displacement < below), MOST_PASSES)
+        if passes == 0:
+            return points.copy()
+    else:
+        passes = iterations
+    for iteration in range(passes):
+        if iteration:
+            with timings.measure("index"):
+                index = NeighbourIndex(moved, absolute_radius, ids)
 
         def report(done: int, iteration: int = iteration) -> None:
             if progress is not None:
-                progress(iteration * len(points) + done, iterations * len(points))
+                progress(iteration * len(points) + done, passes * len(points))
 
         moved = _one_pass(
             moved, ids, index, predict, patch_points, sampling_key(seed, iteration), threads, report, cancelled, timings
         )
+        timings.passes += 1
+        if after_pass is not None:
+            after_pass(timings.passes, moved + offset)
     return np.asarray(moved + offset)
+
+
+def expected_displacement(
+    points: Float64,
+    ids: NDArray[np.uint64],
+    index: NeighbourIndex,
+    predict: Predict,
+    patch_points: int,
+    seed: int = 0,
+) -> float:
+    """How far one pass moves a point, on average over a sample of the (n, 3) points, in units of the radius.
+
+    A measure of the noise for which the network itself is the gauge: it knows shape from noise, whatever the density.
+    index, ids: of the points. The sample depends on ids and seed, so neither on the points' order nor on their pose.
+    """
+    order = np.argsort(ids, kind="stable")
+    rows = np.random.default_rng(seed).choice(order, min(SAMPLE_POINTS, len(order)), replace=False)
+    patches = index.patches(points[rows], ids[rows], patch_points, sampling_key(seed, 0))
+    lengths = np.linalg.norm(_displacements(predict, patches), axis=1)
+    return float(lengths.mean())
 
 
 def _one_pass(
@@ -180,18 +225,10 @@ def _one_pass(
     def evaluate(chosen: NDArray[np.int64], length: int) -> int:
         with timings.measure("patches"):
             patches = index.patches(centres[chosen], centre_ids[chosen], length, key)
-        size = _patches_per_batch(length)
-        parts = []
         with timings.measure("infer"):
-            for start in range(0, len(chosen), size):
-                check()
-                parts.append(predict(patches.points[start : start + size]))
-        displacements = np.concatenate(parts).astype(np.float64)
-        if displacements.shape != (len(chosen), 3) or not np.isfinite(displacements).all():
-            raise InvalidModelError("the network answered with something else than finite displacements")
+            displacements = _displacements(predict, patches, check)
         # r R⁻¹ f(.): R is a rotation, so its inverse is its transpose; rows of `frames` are the axes.
         steps = np.einsum("bi,bij->bj", displacements, patches.frames) * index.radius
-        steps[(patches.counts < MIN_NEIGHBOURS) | ~patches.points.any(axis=(1, 2))] = 0.0
         result[rows[chosen]] = centres[chosen] + steps
         return len(chosen)
 
@@ -226,7 +263,26 @@ def _one_pass(
     return result
 
 
+def _displacements(predict: Predict, patches: Patches, check: Callable[[], None] = lambda: None) -> Float64:
+    """The network's answers for a batch, (B, 3) in patch frames and in units of r; 0 where a patch is none.
+
+    check() is called between the network's batches.
+    """
+    count, length, _ = patches.points.shape
+    size = _patches_per_batch(length)
+    parts = []
+    for start in range(0, count, size):
+        check()
+        parts.append(predict(patches.points[start : start + size]))
+    displacements = np.concatenate(parts).astype(np.float64)
+    if displacements.shape != (count, 3) or not np.isfinite(displacements).all():
+        raise InvalidModelError("the network answered with something else than finite displacements")
+    displacements[(patches.counts < MIN_NEIGHBOURS) | ~patches.points.any(axis=(1, 2))] = 0.0
+    return displacements
+
+
 def _patches_per_batch(length: int) -> int:
+    """Patches of `length` points that go through the network together."""
     return max(1, ROWS_PER_BATCH // length)
 
 

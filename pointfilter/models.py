@@ -1,7 +1,8 @@
 """Model bundles: a folder with model.onnx and model.json.
 
 model.json says what the weights are and how to use them: version, sha256 of model.onnx, architecture, opset, points a
-patch, radius, default iterations, training record, scores. Bundles shipped with the package are in bundles/.
+patch, radius, default iterations (a number or "auto"), training record, scores. Bundles shipped with the package are in
+bundles/.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 from pointfilter.errors import InvalidModelError, ModelNotFoundError
 
@@ -22,14 +23,18 @@ FRAME = "pca-mean-sign"  # the frame's sign rule that the weights were trained w
 BUNDLES = Path(__file__).parent / "bundles"
 DEFAULT_MODEL = "pointfilter-fast"
 
+Auto = Literal["auto"]
+AUTO: Final[Auto] = "auto"
+
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}")
 NAME_RULE = "up to 100 letters, digits and . _ + -, the first a letter or digit"
 
 _FIELDS: dict[str, type | tuple[type, ...]] = {
     "schema": int, "name": str, "version": str, "sha256": str, "opset": int, "frame": str, "patch_points": int,
-    "radius": float, "iterations": int, "parameters": int, "network": dict, "training": dict, "scores": dict,
+    "radius": float, "iterations": (int, str), "parameters": int, "network": dict, "training": dict, "scores": dict,
 }  # fmt: skip
 _RANGES = {"patch_points": (1, 2**16), "radius": (1e-9, 1.0), "iterations": (1, 100)}
+_WORDS = {"iterations": AUTO}  # what may stand in the place of a number
 
 
 @dataclass(frozen=True)
@@ -45,8 +50,8 @@ class ModelBundle:
     """Most points of a patch (N in §3.2)."""
     radius: float
     """Default patch radius, as a fraction of the bounding-box diagonal."""
-    iterations: int
-    """Default number of iterations."""
+    iterations: int | Auto
+    """Default number of iterations, or "auto": as many as the cloud needs (filtering.PASSES)."""
     parameters: int
     network: dict[str, Any]
     training: dict[str, Any] = field(repr=False)
@@ -81,9 +86,12 @@ def load_bundle(folder: Path) -> ModelBundle:
         if not isinstance(described.get(name), kind):
             raise InvalidModelError(f"model.json of {folder.name!r}: {name!r} is missing or of the wrong type")
     for name, (low, high) in _RANGES.items():
-        if not low <= described[name] <= high:
+        if described[name] != _WORDS.get(name) and not (
+            isinstance(described[name], int | float) and low <= described[name] <= high
+        ):
             raise InvalidModelError(
-                f"model.json of {folder.name!r}: {name!r} must be from {low} to {high}, not {described[name]}"
+                f"model.json of {folder.name!r}: {name!r} must be from {low} to {high}"
+                f"{f' or {_WORDS[name]!r}' if name in _WORDS else ''}, not {described[name]!r}"
             )
     described["name"] = folder.resolve().name  # a bundle is found by its folder's name, so that is its name
     for name in ("name", "version"):

@@ -13,6 +13,7 @@ from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import ParameterError
 from pointfilter.filtering import MIN_NEIGHBOURS, Timings, filter_points, resolve_radius
+from pointfilter.models import Auto
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ class Report:
     skipped: int
     """Rows with NaN or Inf, passed through untouched."""
     iterations: int
+    """Passes over the cloud; 0: it was found clean and came back as it was."""
     radius: float
     seed: int
     mean_displacement: float
@@ -74,7 +76,7 @@ def filter_cloud(
     cloud: PointCloud,
     engine: Engine,
     *,
-    iterations: int | None = None,
+    iterations: int | Auto | None = None,
     radius: Radius | None = None,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
@@ -82,7 +84,8 @@ def filter_cloud(
 ) -> tuple[PointCloud, Report]:
     """Filters every finite row of a cloud; everything else in it stays as it is.
 
-    Defaults come from the engine's bundle. See filtering.filter_points for progress, cancelled and what is raised.
+    iterations: a number, or "auto" for as many as the cloud needs. Defaults come from the engine's bundle. See
+    filtering.filter_points for progress, cancelled and what is raised.
     """
     started = time.perf_counter()
     bundle = engine.bundle
@@ -118,7 +121,7 @@ def filter_cloud(
         threads=engine.threads,
         points=len(cloud),
         skipped=int(len(cloud) - finite.sum()),
-        iterations=iterations,
+        iterations=timings.passes,
         radius=absolute,
         seed=seed,
         mean_displacement=float(displacements.mean()),

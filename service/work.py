@@ -20,6 +20,7 @@ from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import FilteringCancelledError
 from pointfilter.limits import ReadLimits
+from pointfilter.models import Auto
 from pointfilter.pipeline import Radius, Report, filter_cloud
 from service.errors import ClientGoneError
 
@@ -31,7 +32,7 @@ class Order:
     """What to do: the request's parameters, checked."""
 
     model: str
-    iterations: int | None
+    iterations: int | Auto | None
     radius: Radius | None
     seed: int
     encoding: str

@@ -42,7 +42,7 @@ def bundle_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     network = Pointfilter(NetworkSettings(encoder=(16, 32), decoder=(16,), norm_after_pool=True))
     network(torch.randn(64, 20, 3))  # moves the running statistics off their defaults
     folder = tmp_path_factory.mktemp("bundles") / "tiny"
-    write_bundle(Loaded(network.eval(), patch_points=64, radius=0.1, training={}), folder, "0.0.1")
+    write_bundle(Loaded(network.eval(), patch_points=64, radius=0.1, training={}), folder, "0.0.1", iterations=2)
     return folder
 
 

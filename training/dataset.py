@@ -18,14 +18,19 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pointfilter.engine import Engine
+from pointfilter.filtering import filter_points
+from pointfilter.models import DEFAULT_MODEL, open_model
 from pointfilter.noise import NoiseKind, add_noise, bounding_box_diagonal
 from pointfilter.patches import NeighbourIndex, stable_ids
 from training.shapes import Mesh, load_meshes, random_shape
 
 Float64 = NDArray[np.float64]
 
+FILTERED_ITERATIONS = 3  # most passes that a cloud of DataSettings.filtered_share went through
 VALIDATION_POINTS = 15_000  # enough to see a trend, few enough to filter in seconds
 VALIDATION_FAMILY = 1  # of shapes; training has family 0
 VALIDATION_SEED = 2**40  # of points and noise: no training cloud's
@@ -54,6 +59,12 @@ class DataSettings:
     """Share of the clouds whose density changes from one side to the other."""
     radius: float = 0.05
     """Patch radius as a fraction of the bounding-box diagonal (§3.2)."""
+    filtered_share: float = 0.0
+    """Share of the clouds that went through filtered_by before: what later iterations see."""
+    filtered_by: str = DEFAULT_MODEL
+    """A bundle's name or folder."""
+    filtered_points: int = 15_000
+    """Most points of such a cloud: a piece of the whole one, since filtering costs more than anything else here."""
     patch_points: int = 256
     """Points of a noisy patch."""
     clean_patch_points: int = 400
@@ -101,8 +112,11 @@ def make_cloud(noisy: Float64, clean: Float64, normals: Float64, radius: float) 
     )
 
 
-def cloud_from_mesh(mesh: Mesh, settings: DataSettings, seed: int) -> TrainingCloud:
-    """One training cloud: density, noise, openness and evenness all drawn from the seed."""
+def cloud_from_mesh(mesh: Mesh, settings: DataSettings, seed: int, engine: Engine | None = None) -> TrainingCloud:
+    """One training cloud: density, noise, openness and evenness all drawn from the seed.
+
+    engine: what filters a share of the clouds before, see DataSettings.filtered_share.
+    """
     rng = np.random.default_rng([seed, settings.seed, 0xC10D])
     count = round(np.exp(rng.uniform(np.log(settings.fewest_points), np.log(settings.most_points))))
     level = settings.noise_low + (settings.noise_high - settings.noise_low) * rng.random() ** settings.noise_skew
@@ -123,6 +137,17 @@ def cloud_from_mesh(mesh: Mesh, settings: DataSettings, seed: int) -> TrainingCl
         noisy = noisy[noisy @ direction < border]
         keep = points @ direction < border
         points, normals = points[keep], normals[keep]
+    if engine is not None and rng.random() < settings.filtered_share:
+        middle = noisy[rng.integers(len(noisy))]
+        _, piece = cKDTree(noisy).query(middle, k=min(settings.filtered_points, len(noisy)))
+        noisy = filter_points(
+            noisy[np.sort(piece)],
+            engine,
+            radius=settings.radius * diagonal,
+            iterations=int(rng.integers(1, FILTERED_ITERATIONS + 1)),
+            patch_points=engine.bundle.patch_points,
+            seed=seed,
+        )
     return make_cloud(noisy, points, normals, settings.radius * diagonal)
 
 
@@ -161,10 +186,11 @@ def training_clouds(
         yield from load_author_clouds(clouds, settings.radius)
         return
     loaded = load_meshes(meshes) if meshes is not None else None
+    engine = Engine(open_model(settings.filtered_by), threads=1) if settings.filtered_share else None
     for number in range(settings.clouds):
         seed = settings.seed * 10_000 + number
         mesh = loaded[number % len(loaded)] if loaded else random_shape(seed)
-        yield cloud_from_mesh(mesh, settings, seed)
+        yield cloud_from_mesh(mesh, settings, seed, engine)
 
 
 def validation_cloud(number: int, settings: DataSettings) -> TrainingCloud:

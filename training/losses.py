@@ -25,6 +25,9 @@ class LossSettings:
     """Support of phi (Eq. 4) in units of r; 0 takes the paper's 4·sqrt(diag/m) from every patch."""
     sigma_p_points: int = 500
     """The paper's m in sigma_p."""
+    sigma_p_shrink: float = 1.0
+    """What is left of sigma_p at the end of a run; it shrinks geometrically. Below 1 for curved surfaces:
+    the best answer to the paper's wide support (about 0.3 r) lies beside them."""
     sigma_n_degrees: float = 15.0
     """Support angle of theta (Eq. 6)."""
     theta_squared: bool = False
@@ -34,13 +37,18 @@ class LossSettings:
 
 
 def filtering_loss(
-    displacements: Tensor, clean: Tensor, normals: Tensor, present: Tensor, settings: LossSettings
+    displacements: Tensor,
+    clean: Tensor,
+    normals: Tensor,
+    present: Tensor,
+    settings: LossSettings,
+    progress: float = 0.0,
 ) -> Tensor:
     """The loss of each patch: (B,).
 
     displacements: (B, 3), the network's answer, so the filtered point itself (the patch is centred).
     clean, normals: (B, M, 3), the clean points in the ball with their unit normals. present: (B, M) bool, False where
-    a row is padding. A patch without clean points costs nothing.
+    a row is padding. progress: how much of the run is over, 0 to 1. A patch without clean points costs nothing.
     """
     offsets = displacements[:, None, :] - clean
     squared = offsets.square().sum(dim=2)
@@ -51,7 +59,8 @@ def filtering_loss(
         main = squared[rows, nearest]
     else:
         distances = (offsets * normals).sum(dim=2).abs()
-        weights = torch.exp(-squared / _sigma_p(clean, present, settings)[:, None].square())
+        sigma_p = _sigma_p(clean, present, settings) * settings.sigma_p_shrink**progress
+        weights = torch.exp(-squared / sigma_p[:, None].square())
         if settings.loss == "bilateral":
             exponent = (1 - (nearest_normals[:, None, :] * normals).sum(dim=2)) / (
                 1 - math.cos(math.radians(settings.sigma_n_degrees))

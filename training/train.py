@@ -180,7 +180,14 @@ class Run:
         for batch in batches_ahead(clouds, settings.data, self.step, last):
             with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
                 displacements = self.network(batch.patches)
-            loss = filtering_loss(displacements, batch.clean, batch.normals, batch.present, settings.loss).mean()
+            loss = filtering_loss(
+                displacements,
+                batch.clean,
+                batch.normals,
+                batch.present,
+                settings.loss,
+                progress=self.step / settings.steps,
+            ).mean()
             self.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_clip)

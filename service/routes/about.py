@@ -13,7 +13,7 @@ from starlette.responses import Response
 
 import pointfilter
 from pointfilter.errors import ModelError
-from pointfilter.models import ModelBundle
+from pointfilter.models import Auto, ModelBundle
 from service.dependencies import HouseDep
 from service.house import House
 from service.problems import answers
@@ -36,7 +36,7 @@ class Model(BaseModel):
     opset: int
     patch_points: int
     radius: float
-    iterations: int
+    iterations: int | Auto
     parameters: int
     network: dict[str, Any]
     training: dict[str, Any]

@@ -7,9 +7,11 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request
+from pydantic import Field
 from starlette.responses import Response
 
 from pointfilter.errors import ParameterError
+from pointfilter.models import Auto
 from pointfilter.pipeline import Radius
 from service.dependencies import AdmittedFolder, ExchangeDep, HouseDep, Ready
 from service.download import FileDownload, content_disposition
@@ -29,6 +31,7 @@ _HEADERS = {
     "X-Request-ID": "The caller's, where it sent a sane one",
     "X-Model": "Name of the model that was used",
     "X-Points": "Points in the file",
+    "X-Iterations": "Passes over the cloud; 0: it was found clean and came back as it was",
     "ETag": "sha256 of the file",
 }
 _FILE = {"type": "string", "format": "binary"}
@@ -74,7 +77,10 @@ async def filter_file(
     exchange: ExchangeDep,
     folder: AdmittedFolder,
     model: Annotated[str | None, Query(description="A name from /models", max_length=100)] = None,
-    iterations: Annotated[int | None, Query(description="Passes over the cloud; by default the model's", ge=1)] = None,
+    iterations: Annotated[
+        Annotated[int, Field(ge=1)] | Auto | None,
+        Query(description="Passes over the cloud, or auto for as many as it needs; by default the model's"),
+    ] = None,
     radius: Annotated[
         str | None,
         Query(
@@ -126,6 +132,7 @@ async def filter_file(
             "Server-Timing": _server_timing(delivery, waited),
             "X-Model": delivery.report.model,
             "X-Points": str(delivery.report.points),
+            "X-Iterations": str(delivery.report.iterations),
             "ETag": f'"{delivery.sha256}"',
         },
     )
@@ -135,7 +142,7 @@ async def _order(
     house: House,
     exchange: Exchange,
     model: str | None,
-    iterations: int | None,
+    iterations: int | Auto | None,
     radius: str | None,
     seed: int,
     encoding: str,
@@ -143,7 +150,7 @@ async def _order(
     """Checks what can be checked before the upload. Raises ParameterError, ModelError."""
     bundle = await asyncio.to_thread(house.engines.bundle, model or house.settings.model)
     exchange.model = bundle.name
-    if iterations is not None and iterations > house.settings.max_iterations:
+    if isinstance(iterations, int) and iterations > house.settings.max_iterations:
         raise ParameterError(
             f"iterations must be from 1 to {house.settings.max_iterations}, got {iterations}",
             limit=house.settings.max_iterations,

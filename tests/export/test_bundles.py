@@ -117,7 +117,7 @@ def test_the_command_exports_a_run(checkpoint: Path, tmp_path: Path, capsys: pyt
     arguments = [str(checkpoint), "--out", str(out), "--version", "7", "--scores", str(tmp_path / "scores.json")]
     assert command.main(arguments) == 0
     bundle = load_bundle(out)
-    assert (bundle.version, bundle.iterations, bundle.scores) == ("7", 2, {"cd": 0.8})
+    assert (bundle.version, bundle.iterations, bundle.scores) == ("7", "auto", {"cd": 0.8})
     assert bundle.training["settings"]["network"]["encoder"] == [8, 16]
     assert bundle.training["steps"] == 0
     assert f"{bundle.parameters} parameters" in capsys.readouterr().out

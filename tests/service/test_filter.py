@@ -53,6 +53,7 @@ def test_curls_default_content_type_is_a_raw_body(client: TestClient, ply: bytes
     ("query", "options"),
     [
         ("iterations=3", {"iterations": 3}),
+        ("iterations=auto", {"iterations": "auto"}),
         ("radius=20%25", {"radius": Radius(0.2, relative=True)}),
         ("radius=20%", {"radius": Radius(0.2, relative=True)}),
         ("radius=0.3", {"radius": Radius(0.3, relative=False)}),

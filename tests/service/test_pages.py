@@ -85,5 +85,5 @@ def test_openapi_describes_both_ways_to_send_a_file(client: TestClient) -> None:
         "model", "iterations", "radius", "seed", "format",
     }  # fmt: skip
     assert set(operation["responses"]["200"]["headers"]) == {
-        "Content-Disposition", "Server-Timing", "X-Request-ID", "X-Model", "X-Points", "ETag",
+        "Content-Disposition", "Server-Timing", "X-Request-ID", "X-Model", "X-Points", "X-Iterations", "ETag",
     }  # fmt: skip

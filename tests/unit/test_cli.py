@@ -64,6 +64,13 @@ def test_options_reach_the_filter(noisy_file: Path, tmp_path: Path, capsys: Capt
         assert (report["model"], report["provider"], report["points"]) == ("tiny", "CPUExecutionProvider", 600)
 
 
+def test_iterations_may_be_left_to_the_cloud(noisy_file: Path, tmp_path: Path, capsys: Capture) -> None:
+    assert run("filter", noisy_file, tmp_path / "a.ply", "--iterations", "auto", "--json") == 0
+    passes = json.loads(capsys.readouterr().out)["iterations"]
+    assert run("filter", noisy_file, tmp_path / "b.ply", "--iterations", passes, "--quiet") == 0
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
 def test_the_same_command_gives_the_same_file(noisy_file: Path, tmp_path: Path) -> None:
     for name, threads in (("a.ply", 1), ("b.ply", 3)):
         assert run("filter", noisy_file, tmp_path / name, "--threads", threads, "--quiet") == 0

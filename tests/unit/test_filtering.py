@@ -14,7 +14,17 @@ from pointfilter.errors import (
     ParameterError,
     TooFewPointsError,
 )
-from pointfilter.filtering import MIN_NEIGHBOURS, Timings, filter_points, resolve_radius
+from pointfilter.filtering import (
+    MIN_NEIGHBOURS,
+    MOST_PASSES,
+    PASSES,
+    Predict,
+    Timings,
+    expected_displacement,
+    filter_points,
+    resolve_radius,
+)
+from pointfilter.patches import NeighbourIndex, sampling_key, stable_ids
 from tests.clouds import pooled
 
 
@@ -37,8 +47,6 @@ def test_a_point_moves_by_the_networks_answer_turned_back_and_scaled() -> None:
 
 
 def test_the_paper_s_equation_row_by_row(noisy_crease: np.ndarray) -> None:
-    from pointfilter.patches import NeighbourIndex, sampling_key, stable_ids
-
     radius, offset = 0.15, (noisy_crease.min(axis=0) + noisy_crease.max(axis=0)) / 2
     points = noisy_crease - offset
     ids = stable_ids(points)
@@ -114,6 +122,68 @@ def test_each_iteration_draws_anew(noisy_crease: np.ndarray, monkeypatch: pytest
     )
     filter_points(noisy_crease, still, iterations=3, seed=5)
     assert len(set(keys)) == 3
+
+
+def steps(length: float) -> Predict:
+    """A network that moves every point as far."""
+    return lambda patches: np.tile(np.array([0, 0, length], np.float32), (len(patches), 1))
+
+
+def test_automatic_iterations_follow_the_displacement(noisy_crease: np.ndarray) -> None:
+    done = []
+    for length in (PASSES[0][0] / 2, *(1.01 * below for below, _ in PASSES)):
+        timings = Timings()
+        filtered = filter_points(noisy_crease, steps(length), radius=0.3, iterations="auto", timings=timings)
+        fixed = filter_points(noisy_crease, steps(length), radius=0.3, iterations=timings.passes or 1)
+        np.testing.assert_array_equal(filtered, fixed if timings.passes else noisy_crease)
+        done.append(timings.passes)
+    assert done == [*(passes for _, passes in PASSES), MOST_PASSES]
+    assert done == sorted(done)
+    assert done[0] == 0
+
+
+def test_every_pass_is_seen(noisy_crease: np.ndarray) -> None:
+    seen: dict[int, np.ndarray] = {}
+    filter_points(noisy_crease, pooled, radius=0.15, iterations=3, after_pass=seen.__setitem__)
+    assert list(seen) == [1, 2, 3]
+    for passes, points in seen.items():
+        np.testing.assert_array_equal(points, filter_points(noisy_crease, pooled, radius=0.15, iterations=passes))
+
+
+def test_a_clean_cloud_comes_back_as_another_array(noisy_crease: np.ndarray) -> None:
+    filtered = filter_points(noisy_crease, still, iterations="auto")
+    assert filtered is not noisy_crease
+    np.testing.assert_array_equal(filtered, noisy_crease)
+
+
+def test_what_is_expected_is_what_happens(noisy_crease: np.ndarray) -> None:
+    """All points are in the sample here, so the mean is that of the pass itself."""
+    radius = 0.1
+    ids = stable_ids(noisy_crease)
+    index = NeighbourIndex(noisy_crease, radius, ids)
+    expected = expected_displacement(noisy_crease, ids, index, pooled, patch_points=500)
+    filtered = filter_points(noisy_crease, pooled, radius=radius, iterations=1)
+    assert expected * radius == pytest.approx(np.linalg.norm(filtered - noisy_crease, axis=1).mean(), rel=1e-6)
+
+
+def test_the_sample_does_not_know_the_order_of_the_rows(
+    noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(filtering, "SAMPLE_POINTS", 40)
+
+    def expected(points: np.ndarray, seed: int) -> float:
+        ids = stable_ids(points)
+        return expected_displacement(points, ids, NeighbourIndex(points, 0.1, ids), pooled, 500, seed)
+
+    shuffle = np.random.default_rng(0).permutation(len(noisy_crease))
+    assert expected(noisy_crease, 0) == expected(noisy_crease[shuffle], 0)
+    assert expected(noisy_crease, 0) != expected(noisy_crease, 1)
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+def test_automatic_iterations_with_a_broken_network(broken: float, noisy_crease: np.ndarray) -> None:
+    with pytest.raises(InvalidModelError):
+        filter_points(noisy_crease, steps(broken), iterations="auto")
 
 
 @pytest.mark.parametrize("count", range(MIN_NEIGHBOURS))

@@ -98,8 +98,16 @@ CHANGES: dict[str, Change] = {
     "radius that is none": lambda d: d.update(radius=float("nan")),
     "radius over all": lambda d: d.update(radius=1.5),
     "no iterations": lambda d: d.update(iterations=0),
+    "iterations by a word that nobody knows": lambda d: d.update(iterations="many"),
+    "iterations by halves": lambda d: d.update(iterations=1.5),
+    "radius by itself": lambda d: d.update(radius="auto"),
     "iterations for ever": lambda d: d.update(iterations=10**6),
 }
+
+
+def test_iterations_may_be_left_to_the_cloud(copy: Path) -> None:
+    change(copy, lambda d: d.update(iterations="auto"))
+    assert load_bundle(copy).iterations == "auto"
 
 
 def test_the_folder_names_the_model(copy: Path) -> None:
