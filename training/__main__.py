@@ -16,7 +16,10 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from training.network import Pointfilter
 
 # glibc gives large blocks back to the system at every free and faults them in again at every step; keeping them more
 # than doubles the throughput of training on a CPU. Read at process start, hence the exec.
@@ -36,7 +39,9 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="go on from the folder's checkpoint, exactly, with the settings that it holds",
     )
-    parser.add_argument("--init", type=Path, help="start from the weights of this checkpoint.pt")
+    parser.add_argument(
+        "--init", type=Path, help="start from the weights of this checkpoint.pt; a narrower network grows into this one"
+    )
     parser.add_argument("--until", type=int, metavar="STEP", help="stop after this step, with a checkpoint")
     parser.add_argument("--seed", type=int, default=None, help="of weights, shapes, noise and batches (default: 0)")
     data = parser.add_argument_group("data", "procedural shapes unless one of these is given")
@@ -58,16 +63,22 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _weights(path: Path) -> dict[str, Any]:
+def _network(path: Path) -> Pointfilter:
     import torch
 
+    from training.network import NetworkSettings, Pointfilter
+
     try:
-        weights: dict[str, Any] = torch.load(path, weights_only=True)["network"]
+        state = torch.load(path, weights_only=True)
+        network = Pointfilter(NetworkSettings.from_dict(state["settings"]["network"]))
+        average = torch.optim.swa_utils.AveragedModel(network, use_buffers=True)
+        average.load_state_dict(state["average"])  # what would be exported
+        network.load_state_dict(average.module.state_dict())
     except OSError:
         raise
     except Exception as error:  # what torch raises for a file that is no checkpoint differs between its versions
         raise ValueError(f"--init: {path} is no checkpoint of a run") from error
-    return weights
+    return network.eval()
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -83,7 +94,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.resume and not (folder / "checkpoint.pt").is_file():
             raise FileNotFoundError(f"--resume: no checkpoint.pt in {folder}")
         settings = load_preset(options.preset, overrides)
-        init = _weights(options.init) if options.init else None
+        init = _network(options.init) if options.init else None
         run = start(
             folder,
             settings,

@@ -42,6 +42,8 @@ class DataSettings:
 
     clouds: int = 240
     """Training clouds; every one has a shape, a density and a noise level of its own."""
+    thin_share: float = 0.0
+    """Share of the procedural shapes that are thin: sheets, tubes, slots, wires, with two surfaces within a patch."""
     fewest_points: int = 10_000
     most_points: int = 300_000
     """Densities are drawn evenly on a logarithmic scale between the two."""
@@ -189,7 +191,7 @@ def training_clouds(
     engine = Engine(open_model(settings.filtered_by), threads=1) if settings.filtered_share else None
     for number in range(settings.clouds):
         seed = settings.seed * 10_000 + number
-        mesh = loaded[number % len(loaded)] if loaded else random_shape(seed)
+        mesh = loaded[number % len(loaded)] if loaded else random_shape(seed, thin_share=settings.thin_share)
         yield cloud_from_mesh(mesh, settings, seed, engine)
 
 

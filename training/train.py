@@ -13,7 +13,6 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from tqdm import tqdm
 
@@ -21,10 +20,12 @@ from pointfilter.filtering import filter_points
 from pointfilter.metrics import chamfer_distance
 from pointfilter.noise import NOISE_KINDS
 from training.dataset import DataSettings, TrainingCloud, batches_ahead, cut_batch, training_clouds, validation_cloud
+from training.grow import check_growth, grow
 from training.losses import LOSSES, LossSettings, filtering_loss
 from training.network import NetworkSettings, Pointfilter
 
 CHECKPOINT_VERSION = 1
+GROWTH_PATCHES = 512  # on which a grown network's new units are measured
 
 OPTIMIZERS = ("adamw", "sgd")
 SCHEDULES = ("one-cycle", "exponential")
@@ -83,19 +84,12 @@ class TrainingSettings:
 class Run:
     """A training run in a folder: checkpoint.pt (everything), log.csv (the loss curve), settings.json."""
 
-    def __init__(
-        self, folder: Path, settings: TrainingSettings, resume: bool, init: dict[str, Tensor] | None = None
-    ) -> None:
+    def __init__(self, folder: Path, settings: TrainingSettings, resume: bool) -> None:
         self.folder = folder
         self.settings = settings
         torch.manual_seed(settings.seed)
         torch.set_num_threads(settings.threads or os.cpu_count() or 1)
         self.network = Pointfilter(settings.network)
-        if init is not None:
-            try:
-                self.network.load_state_dict(init)
-            except RuntimeError as error:
-                raise ValueError(f"the weights to start from do not fit the network: {error}") from error
         moving_average = get_ema_multi_avg_fn(settings.ema_decay)  # type: ignore[no-untyped-call]
         self.average = AveragedModel(self.network, multi_avg_fn=moving_average, use_buffers=True)
         self.optimizer = self._optimizer()
@@ -112,6 +106,11 @@ class Run:
         else:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "settings.json").write_text(json.dumps(dataclasses.asdict(settings), indent=2) + "\n")
+
+    def start_from(self, network: Pointfilter) -> None:
+        """Takes over the weights of a network of the same settings, before the first step."""
+        self.network.load_state_dict(network.state_dict())
+        self.average.module.load_state_dict(network.state_dict())
 
     def _optimizer(self) -> torch.optim.Optimizer:
         if self.settings.optimizer == "sgd":
@@ -270,20 +269,31 @@ def start(
     resume: bool = False,
     meshes: Path | None = None,
     clouds: Path | None = None,
-    init: dict[str, Tensor] | None = None,
+    init: Pointfilter | None = None,
     until: int | None = None,
 ) -> Run:
-    """Starts or resumes a run and trains it to its end (or to step `until`)."""
+    """Starts or resumes a run and trains it to its end (or to step `until`).
+
+    init: where the weights come from; a narrower network grows into the one of the settings. Raises ValueError where it
+    cannot, FileExistsError where the folder holds another run.
+    """
     if resume:
         saved = torch.load(folder / "checkpoint.pt", weights_only=True)
         settings = TrainingSettings.from_dict(saved["settings"])
     elif (folder / "checkpoint.pt").exists():
         raise FileExistsError(f"{folder} holds a run already: go on with --resume, or choose another folder with --out")
-    run = Run(folder, settings, resume, init)
+    if init is not None:
+        if resume:
+            raise ValueError("weights to start from are for a new run; this one goes on from its own checkpoint")
+        check_growth(init.settings, settings.network)
+    run = Run(folder, settings, resume)
     if meshes or clouds or not resume:
         run.source = {name: str(path.absolute()) for name, path in (("meshes", meshes), ("clouds", clouds)) if path}
     meshes, clouds = (Path(run.source[name]) if name in run.source else None for name in ("meshes", "clouds"))
     total = None if clouds else settings.data.clouds
     pool = list(tqdm(training_clouds(settings.data, meshes, clouds), total=total, unit="cloud", desc="clouds"))
+    if init is not None:
+        typical = cut_batch(pool, dataclasses.replace(settings.data, batch=GROWTH_PATCHES), 0).patches
+        run.start_from(init if init.settings == settings.network else grow(init, settings.network, typical))
     run.train(pool, until)
     return run

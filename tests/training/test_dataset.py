@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from pointfilter.noise import NOISE_KINDS
 from training.dataset import (
@@ -45,6 +46,24 @@ def test_batches_come_in_order_wherever_one_begins(clouds: list[TrainingCloud], 
 def test_an_error_in_the_second_thread_reaches_the_first(tiny: TrainingSettings) -> None:
     with pytest.raises((ValueError, IndexError)):
         next(batches_ahead([], tiny.data, 0, 3))
+
+
+def test_a_share_of_the_clouds_is_filtered_before(
+    clouds: list[TrainingCloud], tiny: TrainingSettings, bundle_folder: Path
+) -> None:
+    settings = dataclasses.replace(
+        tiny.data, filtered_share=1.0, filtered_by=str(bundle_folder), filtered_points=500, noise_low=0.02
+    )
+    noisy = list(training_clouds(dataclasses.replace(settings, filtered_share=0.0)))
+    for cloud, before, again in zip(training_clouds(settings), noisy, training_clouds(settings), strict=True):
+        assert len(cloud.points) == min(500, len(before.points))
+        stayed = np.isin(cloud.points, before.points).all(axis=1)
+        assert stayed.mean() < 0.1  # those with too few neighbours
+        np.testing.assert_array_equal(cloud.points, again.points)
+        np.testing.assert_array_equal(cloud.clean, before.clean)
+        reach = cKDTree(before.points).query(cloud.points)[0]
+        assert reach.max() < 3 * cloud.index.radius
+    assert len(noisy) == len(clouds)
 
 
 def test_shapes_of_a_batch(clouds: list[TrainingCloud], tiny: TrainingSettings) -> None:

@@ -43,6 +43,15 @@ def patches(seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.
     return answers, clean, normals, present
 
 
+def test_the_support_shrinks_with_the_run() -> None:
+    answers, clean, normals, present = patches(3)
+    shrinking = LossSettings(sigma_p=0.4, sigma_p_shrink=0.25)
+    for progress, sigma_p in ((0.0, 0.4), (0.5, 0.2), (1.0, 0.1)):
+        found = filtering_loss(answers, clean, normals, present, shrinking, progress)
+        fixed = filtering_loss(answers, clean, normals, present, LossSettings(sigma_p=sigma_p))
+        torch.testing.assert_close(found, fixed)
+
+
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize(
     "flags",

@@ -168,10 +168,25 @@ def test_training_lowers_the_loss(
 
 
 def test_weights_may_be_taken_over(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
-    run = Run(tmp_path / "new", dataclasses.replace(tiny, seed=5), resume=False, init=straight.network.state_dict())
-    for key, value in straight.network.state_dict().items():
-        assert torch.equal(run.network.state_dict()[key], value)
+    run = start(tmp_path / "new", dataclasses.replace(tiny, seed=5), init=straight.network, until=0)
+    for network in (run.network, run.average.module):
+        for key, value in straight.network.state_dict().items():
+            assert torch.equal(network.state_dict()[key], value)
     assert run.step == 0
+
+
+def test_a_narrower_network_grows(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
+    widths = [2 * width for width in tiny.network.encoder]
+    wider = dataclasses.replace(tiny, network=dataclasses.replace(tiny.network, encoder=(*widths[:1], *widths)))
+    run = start(tmp_path / "new", wider, init=straight.network.eval(), until=0)
+    patches = torch.randn(8, 20, 3)
+    with torch.inference_mode():
+        np.testing.assert_allclose(run.network.eval()(patches), straight.network(patches), atol=1e-5)
+
+
+def test_a_run_that_goes_on_takes_no_other_weights(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
+    with pytest.raises(ValueError, match="for a new run"):
+        start(straight.folder, tiny, resume=True, init=straight.network)
 
 
 def test_the_seed_decides_the_weights(tmp_path: Path, tiny: TrainingSettings) -> None:

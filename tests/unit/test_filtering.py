@@ -269,6 +269,7 @@ def test_progress_only_rises_and_ends_at_the_total(
     filter_points(noisy_crease, pooled, iterations=3, threads=threads, progress=progress)
     done = [call[0] for call in calls]
     assert done == sorted(done)
+    assert done[0] == 0
     assert done[-1] == 3 * len(noisy_crease)
     assert {call[1] for call in calls} == {3 * len(noisy_crease)}
     assert len(calls) > 6
