@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from training.network import NetworkSettings, Pointfilter
-from training.train import CHECKPOINT_VERSION
+from training.train import CHECKPOINT_VERSION, trained_network, training_record
 
 AUTHORS_PATCH_POINTS = 500
 _AUTHORS_KEYS = (
@@ -62,26 +62,8 @@ def _ours(state: dict[str, Any], path: Path) -> Loaded:
         raise ValueError(
             f"{path} has checkpoint version {state.get('version')!r}, this code reads {CHECKPOINT_VERSION}"
         )
-    settings = state["settings"]
-    network = Pointfilter(NetworkSettings.from_dict(settings["network"]))
-    if settings["ema_decay"]:
-        prefix = "module."
-        weights = {key.removeprefix(prefix): value for key, value in state["average"].items() if key.startswith(prefix)}
-    else:
-        weights = state["network"]
-    network.load_state_dict(weights)
-    history = state["history"]
-    record = {
-        "settings": settings,
-        "steps": state["step"],
-        "patches": state["step"] * settings["data"]["batch"],
-        "hours": round(state["seconds"] / 3600, 3),
-        "curve": [
-            {key: row[key] for key in ("step", "loss", "validation_loss", "cd_1", "cd_2") if key in row}
-            for row in history
-        ],
-    }
-    return Loaded(network.eval(), settings["data"]["patch_points"], settings["data"]["radius"], record)
+    data = state["settings"]["data"]
+    return Loaded(trained_network(state), data["patch_points"], data["radius"], training_record(state))
 
 
 def _authors(weights: dict[str, Tensor]) -> Loaded:

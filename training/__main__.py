@@ -16,10 +16,7 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from training.network import Pointfilter
+from typing import Any
 
 # glibc gives large blocks back to the system at every free and faults them in again at every step; keeping them more
 # than doubles the throughput of training on a CPU. Read at process start, hence the exec.
@@ -63,22 +60,19 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _network(path: Path) -> Pointfilter:
+def _checkpoint(path: Path) -> dict[str, Any]:
     import torch
 
-    from training.network import NetworkSettings, Pointfilter
+    from training.train import trained_network
 
     try:
-        state = torch.load(path, weights_only=True)
-        network = Pointfilter(NetworkSettings.from_dict(state["settings"]["network"]))
-        average = torch.optim.swa_utils.AveragedModel(network, use_buffers=True)
-        average.load_state_dict(state["average"])  # what would be exported
-        network.load_state_dict(average.module.state_dict())
+        state: dict[str, Any] = torch.load(path, weights_only=True)
+        trained_network(state)
     except OSError:
         raise
     except Exception as error:  # what torch raises for a file that is no checkpoint differs between its versions
         raise ValueError(f"--init: {path} is no checkpoint of a run") from error
-    return network.eval()
+    return state
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -94,7 +88,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.resume and not (folder / "checkpoint.pt").is_file():
             raise FileNotFoundError(f"--resume: no checkpoint.pt in {folder}")
         settings = load_preset(options.preset, overrides)
-        init = _network(options.init) if options.init else None
+        init = _checkpoint(options.init) if options.init else None
         run = start(
             folder,
             settings,

@@ -44,8 +44,8 @@ def grow(narrow: Pointfilter, settings: NetworkSettings, patches: Tensor) -> Poi
         wide.head.weight[:, width:] = 0
         wide.head.weight[:, :width] = narrow.head.weight
         wide.head.bias[:] = narrow.head.bias
-        _measure(wide, patches)
         for number in inserted:  # what such a layer's norm takes away, its weight and bias give back
+            _measure(wide, patches)
             _, norm = wide.encoder_layers()[number]
             kept = encoder[number]
             mean, variance = _statistics(norm)

@@ -99,6 +99,8 @@ class Run:
         self.history: list[dict[str, float]] = []
         self.recent: list[float] = []
         """Losses since the last row of the history."""
+        self.before: list[dict[str, Any]] = []
+        """Records of the runs that the first weights came from."""
         self.source: dict[str, str] = {}
         """Where the user's own data is: "meshes" or "clouds" and the folder. Empty for procedural shapes."""
         if resume:
@@ -107,8 +109,9 @@ class Run:
             folder.mkdir(parents=True, exist_ok=True)
             (folder / "settings.json").write_text(json.dumps(dataclasses.asdict(settings), indent=2) + "\n")
 
-    def start_from(self, network: Pointfilter) -> None:
-        """Takes over the weights of a network of the same settings, before the first step."""
+    def start_from(self, network: Pointfilter, before: list[dict[str, Any]]) -> None:
+        """Takes over the weights of a network of the same settings, before the first step; `before` made them."""
+        self.before = before
         self.network.load_state_dict(network.state_dict())
         self.average.module.load_state_dict(network.state_dict())
 
@@ -136,6 +139,7 @@ class Run:
         self.scheduler.load_state_dict(state["scheduler"])
         self.step, self.seconds, self.history = state["step"], state["seconds"], state["history"]
         self.source, self.recent = state.get("source", {}), state.get("recent", [])
+        self.before = state.get("before", [])
 
     def save(self) -> None:
         """Writes the checkpoint so that a kill at any moment leaves the old one or the new one, whole."""
@@ -147,6 +151,7 @@ class Run:
             "history": self.history,
             "recent": self.recent,
             "source": self.source,
+            "before": self.before,
             "network": self.network.state_dict(),
             "average": self.average.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -256,6 +261,33 @@ def predictor(network: Pointfilter) -> Any:
     return predict
 
 
+def trained_network(state: dict[str, Any]) -> Pointfilter:
+    """The network of a checkpoint as it is exported: the averaged weights, unless the run kept none."""
+    network = Pointfilter(NetworkSettings.from_dict(state["settings"]["network"]))
+    weights = state["network"]
+    if state["settings"]["ema_decay"]:
+        prefix = "module."
+        weights = {key.removeprefix(prefix): value for key, value in state["average"].items() if key.startswith(prefix)}
+    network.load_state_dict(weights)
+    return network.eval()
+
+
+def training_record(state: dict[str, Any]) -> dict[str, Any]:
+    """How the weights of a checkpoint came about, the runs that they started from included, the first one first."""
+    settings = state["settings"]
+    return {
+        "settings": settings,
+        "steps": state["step"],
+        "patches": state["step"] * settings["data"]["batch"],
+        "hours": round(state["seconds"] / 3600, 3),
+        "curve": [
+            {key: row[key] for key in ("step", "loss", "validation_loss", "cd_1", "cd_2") if key in row}
+            for row in state["history"]
+        ],
+        "before": state.get("before", []),
+    }
+
+
 def _use_bfloat16(precision: str) -> bool:
     if precision == "auto":
         return bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
@@ -269,31 +301,35 @@ def start(
     resume: bool = False,
     meshes: Path | None = None,
     clouds: Path | None = None,
-    init: Pointfilter | None = None,
+    init: dict[str, Any] | None = None,
     until: int | None = None,
 ) -> Run:
     """Starts or resumes a run and trains it to its end (or to step `until`).
 
-    init: where the weights come from; a narrower network grows into the one of the settings. Raises ValueError where it
-    cannot, FileExistsError where the folder holds another run.
+    init: the checkpoint where the weights come from; a narrower network grows into the one of the settings. Raises
+    ValueError where it cannot, FileExistsError where the folder holds another run.
     """
+    first = None if init is None else trained_network(init)
     if resume:
         saved = torch.load(folder / "checkpoint.pt", weights_only=True)
         settings = TrainingSettings.from_dict(saved["settings"])
     elif (folder / "checkpoint.pt").exists():
         raise FileExistsError(f"{folder} holds a run already: go on with --resume, or choose another folder with --out")
-    if init is not None:
+    if first is not None:
         if resume:
             raise ValueError("weights to start from are for a new run; this one goes on from its own checkpoint")
-        check_growth(init.settings, settings.network)
+        check_growth(first.settings, settings.network)
     run = Run(folder, settings, resume)
     if meshes or clouds or not resume:
         run.source = {name: str(path.absolute()) for name, path in (("meshes", meshes), ("clouds", clouds)) if path}
     meshes, clouds = (Path(run.source[name]) if name in run.source else None for name in ("meshes", "clouds"))
     total = None if clouds else settings.data.clouds
     pool = list(tqdm(training_clouds(settings.data, meshes, clouds), total=total, unit="cloud", desc="clouds"))
-    if init is not None:
-        typical = cut_batch(pool, dataclasses.replace(settings.data, batch=GROWTH_PATCHES), 0).patches
-        run.start_from(init if init.settings == settings.network else grow(init, settings.network, typical))
+    if init is not None and first is not None:
+        if first.settings != settings.network:
+            typical = cut_batch(pool, dataclasses.replace(settings.data, batch=GROWTH_PATCHES), 0).patches
+            first = grow(first, settings.network, typical)
+        record = training_record(init)
+        run.start_from(first, [*record.pop("before"), record])
     run.train(pool, until)
     return run

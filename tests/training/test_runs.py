@@ -167,26 +167,35 @@ def test_training_lowers_the_loss(
     assert loss() < 0.8 * before
 
 
+def checkpoint(run: Run) -> dict[str, object]:
+    return torch.load(run.folder / "checkpoint.pt", weights_only=True)
+
+
 def test_weights_may_be_taken_over(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
-    run = start(tmp_path / "new", dataclasses.replace(tiny, seed=5), init=straight.network, until=0)
+    run = start(tmp_path / "new", dataclasses.replace(tiny, seed=5), init=checkpoint(straight), until=0)
     for network in (run.network, run.average.module):
-        for key, value in straight.network.state_dict().items():
+        for key, value in straight.average.module.state_dict().items():
             assert torch.equal(network.state_dict()[key], value)
     assert run.step == 0
+    (before,) = run.before
+    assert (before["steps"], before["settings"]["seed"]) == (straight.step, tiny.seed)
+    third = start(tmp_path / "third", tiny, init=checkpoint(run), until=0)
+    assert [record["settings"]["seed"] for record in third.before] == [tiny.seed, 5]
+    assert Run(third.folder, tiny, resume=True).before == third.before
 
 
 def test_a_narrower_network_grows(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
     widths = [2 * width for width in tiny.network.encoder]
     wider = dataclasses.replace(tiny, network=dataclasses.replace(tiny.network, encoder=(*widths[:1], *widths)))
-    run = start(tmp_path / "new", wider, init=straight.network.eval(), until=0)
+    run = start(tmp_path / "new", wider, init=checkpoint(straight), until=0)
     patches = torch.randn(8, 20, 3)
     with torch.inference_mode():
-        np.testing.assert_allclose(run.network.eval()(patches), straight.network(patches), atol=1e-5)
+        np.testing.assert_allclose(run.network.eval()(patches), straight.average.module.eval()(patches), atol=1e-5)
 
 
 def test_a_run_that_goes_on_takes_no_other_weights(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
     with pytest.raises(ValueError, match="for a new run"):
-        start(straight.folder, tiny, resume=True, init=straight.network)
+        start(straight.folder, tiny, resume=True, init=checkpoint(straight))
 
 
 def test_the_seed_decides_the_weights(tmp_path: Path, tiny: TrainingSettings) -> None:
