@@ -1,12 +1,15 @@
-"""Accuracy of a model on clouds with known surfaces: one command, one table, everything in it measured in this run.
+"""Accuracy of the bundles and of the classics on clouds with known surfaces: one command, one table.
 
-    python -m benchmarks.quality --data DIR                 # the default model, one and two iterations
-    python -m benchmarks.quality --data DIR --model NAME --iterations 1 2 4 --noise 0.005 0.01 --json scores.json
+    python -m benchmarks.quality --data DIR                          # every bundle, classic and column: hours
+    python -m benchmarks.quality --data DIR --models pointfilter-fast --classics --columns '0.5 %' '1 %'
+    python -m benchmarks.quality --data DIR --json scores.json       # keeps every row; goes on where it stopped
 
-DIR is laid out like the paper's test clouds: NAME.npy (clean), NAME_0.005.npy (noisy, row for row) and mesh/*.ply
-(surfaces; the one that fits a cloud is found by distance). The data is not part of this repository: --data or
-POINTFILTER_BENCHMARK_DATA says where it lies. CD ×1e5, P2F ×1e3, clean model scaled to a diagonal of 1 (§4.3). "limit"
-is the exact projection of the noisy points onto the surface.
+DIR holds paper4/ (clean clouds NAME.npy, noisy copies NAME_0.005.npy, surfaces mesh/*.ply) and meshes/*.ply; either may
+be missing. The data is not part of this repository: --data or POINTFILTER_BENCHMARK_DATA says where it lies.
+
+Rows: noisy; limit, the exact projection of the noisy points onto the surface; every bundle after 1, 2, 4 and auto
+iterations; the classics (classics.py), each tuned on the paper's clouds for the noise at hand. Columns: subjects.py.
+CD ×1e5, P2F ×1e3, both for a clean cloud scaled to a diagonal of 1 (§4.3); edge: P2F close to sharp edges.
 """
 
 from __future__ import annotations
@@ -14,133 +17,177 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pointfilter.cloud import PointCloud
+from benchmarks import classics
+from benchmarks.subjects import COLUMNS, Column, Subject, load_clouds, load_meshes
 from pointfilter.engine import Engine
-from pointfilter.evaluation import read_mesh
-from pointfilter.metrics import chamfer_distance, closest_on_surface, normalised, point_to_surface
-from pointfilter.models import open_model
-from pointfilter.pipeline import filter_cloud
+from pointfilter.errors import FilteringCancelledError
+from pointfilter.filtering import filter_points
+from pointfilter.metrics import closest_on_surface
+from pointfilter.models import available_models, open_model
+from pointfilter.noise import bounding_box_diagonal
 
 Float64 = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Subject:
-    """One clean cloud with its surface; the noisy clouds are beside it on disk."""
-
-    name: str
-    clean: Float64
-    vertices: Float64
-    faces: NDArray[np.int64]
-
-    def scores(self, points: Float64) -> dict[str, float]:
-        """CD ×1e5 and P2F ×1e3 of points in the units of the files."""
-        clean, scaled, vertices = normalised(self.clean, points, self.vertices)
-        return {
-            "cd": 1e5 * chamfer_distance(clean, scaled),
-            "p2f": 1e3 * float(point_to_surface(scaled, vertices, self.faces).mean()),
-        }
-
-
-def load_subjects(folder: Path) -> list[Subject]:
-    """Every NAME.npy of a folder that is no noisy copy, with the mesh that lies closest to it."""
-    meshes = [read_mesh(path) for path in sorted((folder / "mesh").glob("*.ply"))]
-    subjects = []
-    for path in sorted(folder.glob("*.npy")):
-        if re.search(r"_0\.\d+$", path.stem):
-            continue
-        clean = np.load(path, allow_pickle=False).astype(np.float64)
-        probe = clean[:: max(1, len(clean) // 500)]
-        distances = [point_to_surface(probe, *mesh).mean() for mesh in meshes]
-        vertices, faces = meshes[int(np.argmin(distances))]
-        subjects.append(Subject(path.stem, clean, vertices, faces))
-    return subjects
+Row = dict[str, Any]
+FIGURES = ("cd", "p2f", "edge", "seconds")
+LONGEST = 4  # iterations of the longest row
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.quality", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, default=os.environ.get("POINTFILTER_BENCHMARK_DATA"))
-    parser.add_argument("--model", help="a bundle's name or folder (default: the package's default)")
-    parser.add_argument("--iterations", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--noise", nargs="+", default=["0.005"], help="levels as in the file names (default: 0.005)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path, help="write the table there as well")
-    options = parser.parse_args(arguments)
-    if options.data is None or not Path(options.data, "mesh").is_dir():
+    options = _parser().parse_args(arguments)
+    folders = [] if options.data is None else [Path(options.data, name) for name in ("paper4", "meshes")]
+    if not any(folder.is_dir() for folder in folders):
         print(
-            "no benchmark data: name a folder with clouds and mesh/ by --data or POINTFILTER_BENCHMARK_DATA",
+            "no benchmark data: name a folder with paper4/ or meshes/ by --data or POINTFILTER_BENCHMARK_DATA",
             file=sys.stderr,
         )
         return 2
-    engine = Engine(open_model(options.model))
-    subjects = load_subjects(Path(options.data))
-    table = []
-    for level in options.noise:
-        for subject in subjects:
-            noisy_path = Path(options.data) / f"{subject.name}_{level}.npy"
-            if noisy_path.is_file():
-                table += _rows(subject, level, np.load(noisy_path).astype(np.float64), engine, options)
-    if not table:
-        print(f"no cloud with noise {', '.join(options.noise)} in {options.data}", file=sys.stderr)
-        return 2
-    _print(table)
-    if options.json:
-        scores = {"model": engine.bundle.name, "sha256": engine.bundle.sha256, "means": _means(table), "rows": table}
-        options.json.write_text(json.dumps(scores, indent=1) + "\n")
+    subjects = {
+        "paper": load_clouds(folders[0]) if folders[0].is_dir() else [],
+        "meshes": load_meshes(folders[1]) if folders[1].is_dir() else [],
+    }
+    engines = [Engine(open_model(name)) for name in options.models]
+    for name, reason in classics.available().items():
+        if name in options.classics and reason:
+            print(f"left out: {name}: {reason}", file=sys.stderr)
+            options.classics.remove(name)
+    table: list[Row] = json.loads(options.json.read_text())["rows"] if options.json and options.json.exists() else []
+    for column in (column for column in COLUMNS if column.name in options.columns):
+        for subject in subjects[column.subjects]:
+            for row in _rows(subject, column, engines, options.classics, table):
+                table.append(row)
+                print("  " + _line(row), file=sys.stderr, flush=True)
+                if options.json:
+                    _save(options.json, table)
+    print(report(table, options.columns))
     return 0
 
 
-Row = dict[str, str | float]
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.quality", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    columns = [column.name for column in COLUMNS]
+    parser.add_argument("--data", type=Path, default=os.environ.get("POINTFILTER_BENCHMARK_DATA"))
+    parser.add_argument("--models", nargs="*", default=list(available_models()), help="names or folders of bundles")
+    parser.add_argument("--classics", nargs="*", default=list(classics.available()), help="default: all that are there")
+    parser.add_argument(
+        "--columns", nargs="+", default=columns, choices=columns, metavar="NAME", help=", ".join(columns)
+    )
+    parser.add_argument(
+        "--json", type=Path, help="keep the rows there; those of the same weights are not measured again"
+    )
+    return parser
 
 
-def _rows(subject: Subject, level: str, noisy: Float64, engine: Engine, options: argparse.Namespace) -> list[Row]:
-    def row(method: str, points: Float64, seconds: float) -> Row:
-        found: Row = {
-            "noise": level,
-            "cloud": subject.name,
-            "method": method,
-            **subject.scores(points),
-            "seconds": seconds,
-        }
-        print(f"  {level} {subject.name}: {method}", file=sys.stderr)
-        return found
+def _rows(
+    subject: Subject, column: Column, engines: Iterable[Engine], methods: Iterable[str], known: list[Row]
+) -> Iterator[Row]:
+    """The rows of one cloud in one column that are not known yet."""
+    done = {
+        (row["method"], row["weights"]) for row in known if (row["column"], row["cloud"]) == (column.name, subject.name)
+    }
+    clean, noisy = subject.clouds(column)
 
-    rows = [
-        row("noisy", noisy, 0.0),
-        row("limit", closest_on_surface(noisy, subject.vertices, subject.faces), 0.0),
-    ]
-    for iterations in options.iterations:
-        started = time.perf_counter()
-        filtered, _ = filter_cloud(PointCloud(noisy.copy()), engine, iterations=iterations, seed=options.seed)
-        rows.append(row(f"{engine.bundle.name} ×{iterations}", filtered.xyz, time.perf_counter() - started))
-    return rows
+    def row(method: str, points: Float64, seconds: float, weights: str = "", **more: int) -> Row:
+        scores = subject.scores(clean, points)
+        named = {"column": column.name, "cloud": subject.name, "method": method, "weights": weights}
+        return {**named, **scores, "seconds": seconds, **more}
 
-
-def _means(table: list[Row]) -> list[Row]:
-    means: list[Row] = []
-    for noise, method in dict.fromkeys((row["noise"], row["method"]) for row in table):
-        chosen = [row for row in table if (row["noise"], row["method"]) == (noise, method)]
-        values = {name: float(np.mean([float(row[name]) for row in chosen])) for name in ("cd", "p2f", "seconds")}
-        means.append({"noise": noise, "cloud": f"mean of {len(chosen)}", "method": method, **values})
-    return means
+    if ("noisy", "") not in done:
+        yield row("noisy", noisy, 0.0)
+    if ("limit", "") not in done:
+        yield row("limit", closest_on_surface(noisy, subject.vertices, subject.faces), 0.0)
+    for engine in engines:
+        name, weights = engine.bundle.name, engine.bundle.sha256[:12]
+        if (f"{name} auto", weights) not in done:
+            for iterations, (points, seconds, passes) in _filtered(noisy, engine).items():
+                yield row(f"{name} {iterations}", points, seconds, weights, passes=passes)
+    for method in methods:
+        if (method, "") not in done:
+            started = time.perf_counter()
+            points = classics.smooth(method, noisy, column.level)
+            yield row(method, points, time.perf_counter() - started)
 
 
-def _print(table: list[Row]) -> None:
-    print(f"{'noise':8}{'cloud':24}{'method':28}{'CD x1e5':>10}{'P2F x1e3':>10}{'seconds':>10}")
-    for row in [*table, *_means(table)]:
-        figures = "".join(f"{float(row[name]):10.3f}" for name in ("cd", "p2f"))
-        print(f"{row['noise']:8}{row['cloud']:24}{row['method']:28}{figures}{float(row['seconds']):10.1f}")
+def _filtered(noisy: Float64, engine: Engine) -> dict[str, tuple[Float64, float, int]]:
+    """The cloud after 1, 2, 4 and auto iterations, with seconds and passes: one run sees them all.
+
+    A run of four passes goes through one and two of them, and through what auto would have chosen.
+    """
+    radius = engine.bundle.radius * bounding_box_diagonal(noisy)
+    seen: dict[int, tuple[Float64, float]] = {}
+
+    automatic = 0
+
+    def planned(_done: int, total: int) -> None:
+        nonlocal automatic
+        automatic = total // len(noisy)
+
+    def run(iterations: Any, **more: Any) -> None:
+        filter_points(
+            noisy,
+            engine,
+            radius=radius,
+            iterations=iterations,
+            patch_points=engine.bundle.patch_points,
+            threads=engine.threads,
+            **more,
+        )
+
+    started = time.perf_counter()
+    with suppress(FilteringCancelledError):  # once it is known how many passes auto takes
+        run("auto", progress=planned, cancelled=lambda: automatic > 0)
+    judged = time.perf_counter() - started
+    started = time.perf_counter()
+    run(LONGEST, after_pass=lambda passes, points: seen.update({passes: (points, time.perf_counter() - started)}))
+    seen[0] = (noisy, 0.0)
+    result = {str(passes): (*seen[passes], passes) for passes in (1, 2, LONGEST)}
+    points, seconds = seen[automatic]
+    return {**result, "auto": (points, judged + seconds, automatic)}
+
+
+def _save(path: Path, table: list[Row]) -> None:
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps({"rows": table, "means": means(table)}, indent=1) + "\n")
+    partial.replace(path)
+
+
+def means(table: list[Row]) -> list[Row]:
+    """One row a column and method: the mean over the clouds."""
+    found = []
+    for column, method, weights in dict.fromkeys((row["column"], row["method"], row["weights"]) for row in table):
+        chosen = [row for row in table if (row["column"], row["method"], row["weights"]) == (column, method, weights)]
+        values = {name: float(np.mean([row[name] for row in chosen])) for name in FIGURES}
+        found.append(
+            {"column": column, "cloud": f"mean of {len(chosen)}", "method": method, "weights": weights, **values}
+        )
+    return found
+
+
+def report(table: list[Row], columns: Iterable[str]) -> str:
+    """The table as text: every cloud, then the means, column by column."""
+    head = f"{'column':18}{'cloud':20}{'method':26}{'CD x1e5':>9}{'P2F x1e3':>10}{'edge x1e3':>10}"
+    lines = [f"{head}{'seconds':>9}{'passes':>8}"]
+    for rows in (table, means(table)):
+        for column in columns:
+            lines += ["", *(_line(row) for row in rows if row["column"] == column)]
+    return "\n".join(lines)
+
+
+def _line(row: Row) -> str:
+    named = f"{row['column']:18}{row['cloud']:20}{row['method']:26}"
+    figures = f"{row['cd']:9.3f}{row['p2f']:10.3f}{row['edge']:10.3f}{row['seconds']:9.1f}"
+    return named + figures + (f"{row['passes']:8d}" if "passes" in row else "")
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from pointfilter.noise import NoiseKind, add_noise
 Float64 = NDArray[np.float64]
 
 SHARP_DEGREES = 30  # an edge of the mesh is sharp where its faces' normals differ by more
-EDGE_REACH = 0.01  # of the diagonal: points this close to a sharp edge count for `edge`
+EDGE_REACH = 0.01  # of the diagonal: a point counts for `edge` when the clean point nearest to it is this close to one
 EDGE_SPACING = 0.0005  # of the diagonal: how densely sharp edges are sampled to find them
 THINNEST = 0.1  # of the density of the dense side, on the thin side of an uneven cloud
 
@@ -91,7 +91,12 @@ class Subject:
 
     def clouds(self, column: Column) -> tuple[Float64, Float64]:
         """The clean and the noisy cloud of a column, row for row."""
-        if column.kind == "gaussian" and column.points is None and not column.uneven and column.level in self.noisy_files:
+        if (
+            column.kind == "gaussian"
+            and column.points is None
+            and not column.uneven
+            and column.level in self.noisy_files
+        ):
             return self.clean, np.load(self.noisy_files[column.level], allow_pickle=False).astype(np.float64)
         rng = np.random.default_rng(zlib.crc32(f"{self.name} {column.name}".encode()))
         clean = self.clean
@@ -112,7 +117,8 @@ class Subject:
         distances = point_to_surface(points, vertices, self.faces)
         close = np.zeros(len(points), dtype=bool)
         if len(edges):
-            close = np.isfinite(cKDTree(edges).query(points, distance_upper_bound=EDGE_REACH)[0])
+            to_edge, _ = cKDTree(edges).query(clean, distance_upper_bound=EDGE_REACH, workers=-1)
+            close = np.isfinite(to_edge)[cKDTree(clean).query(points, workers=-1)[1]]
         return {
             "cd": 1e5 * chamfer_distance(clean, points),
             "p2f": 1e3 * float(distances.mean()),

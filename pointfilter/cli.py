@@ -219,8 +219,9 @@ class _Progress:
 
 def _summary(source: str, target: str, report: Report) -> str:
     skipped = f", {report.skipped} without a place left alone" if report.skipped else ""
+    passes = f"{report.iterations} iterations" if report.iterations else "found clean and left as it was"
     return (
-        f"{source} -> {target}: {report.points} points{skipped}, {report.iterations} iterations with {report.model}, "
+        f"{source} -> {target}: {report.points} points{skipped}, {passes} with {report.model}, "
         f"radius {report.radius:.4g}, mean displacement {report.mean_displacement:.3g}, {report.seconds['total']:.1f} s"
     )
 

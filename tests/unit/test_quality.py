@@ -1,0 +1,138 @@
+"""The quality benchmark on a small cloud: its rows are the product's own results, and it goes on where it stopped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+
+pytest.importorskip("trimesh", reason="the benchmarks extra is not installed")
+
+from benchmarks import quality
+from benchmarks.subjects import COLUMNS, Column, Subject, load_clouds, load_meshes
+from pointfilter import Engine, PointCloud, filter_cloud
+from pointfilter.noise import add_noise
+from tests.clouds import crease
+
+COARSE, FINE = 0.02, 0.005
+
+
+def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    rows = np.array([tuple(row) for row in vertices], dtype=[(name, "f8") for name in "xyz"])
+    lists = np.array([(row,) for row in faces.tolist()], dtype=[("vertex_indices", "i4", (3,))])
+    elements = [plyfile.PlyElement.describe(rows, "vertex"), plyfile.PlyElement.describe(lists, "face")]
+    plyfile.PlyData(elements).write(str(path))
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """One crease: two squares that meet in a right angle along the y axis, as tests.clouds makes them."""
+    rng = np.random.default_rng(0)
+    clean = crease(700, rng, angle=np.pi / 2)
+    (tmp_path / "paper4" / "mesh").mkdir(parents=True)
+    np.save(tmp_path / "paper4" / "crease.npy", clean)
+    np.save(tmp_path / "paper4" / f"crease_{FINE}.npy", add_noise(clean, FINE, rng).astype(np.float32))
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1]], dtype=np.float64)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 5, 4], [0, 3, 5]])
+    write_mesh(tmp_path / "paper4" / "mesh" / "surface.ply", corners, faces)
+    (tmp_path / "meshes").mkdir()
+    write_mesh(tmp_path / "meshes" / "angle.ply", corners, faces)
+    return tmp_path
+
+
+@pytest.fixture
+def subject(data: Path) -> Subject:
+    (found,) = load_clouds(data / "paper4")
+    return found
+
+
+def test_the_surface_fits_the_clean_cloud_and_has_one_sharp_edge(subject: Subject) -> None:
+    scores = subject.scores(subject.clean, subject.clean)
+    assert scores["cd"] == 0
+    assert scores["p2f"] < 1e-6
+    edges = subject.sharp_edges
+    np.testing.assert_allclose(edges[:, [0, 2]], 0, atol=1e-12)
+    assert (edges[:, 1].min(), edges[:, 1].max()) == (0, 1)
+    assert np.diff(np.sort(edges[:, 1])).max() < 0.001
+
+
+def test_points_close_to_the_edge_are_told_apart(subject: Subject) -> None:
+    """A cloud moved along z by h: the upright square stays on the surface, the lying one is h off."""
+    moved = subject.clean + np.array([0, 0, 0.001])
+    diagonal = np.linalg.norm(np.ptp(subject.clean, axis=0))
+    lying = subject.clean[:, 2] < 1e-9
+    scores = subject.scores(subject.clean, moved)
+    assert scores["p2f"] == pytest.approx(1e3 * 0.001 * lying.mean() / diagonal, rel=0.02)
+    close = np.hypot(subject.clean[:, 0], subject.clean[:, 2]) < 0.01 * diagonal
+    assert scores["edge"] == pytest.approx(1e3 * 0.001 * lying[close].mean() / diagonal, rel=0.25)
+
+
+def test_columns_are_the_same_in_every_run_and_what_they_say(subject: Subject) -> None:
+    for column in COLUMNS:
+        clean, noisy = subject.clouds(column)
+        again = subject.clouds(column)
+        np.testing.assert_array_equal(noisy, again[1])
+        assert clean.shape == noisy.shape
+        assert (clean == noisy).all() == (column.level == 0)
+    clean, noisy = subject.clouds(Column("few", COARSE, points=200))
+    assert len(clean) == 200
+    assert np.linalg.norm(noisy - clean, axis=1).mean() == pytest.approx(1.6 * COARSE * np.sqrt(3), rel=0.1)
+    on_disk = np.load(next(iter(subject.noisy_files.values())))
+    np.testing.assert_array_equal(subject.clouds(Column("0.5 %", FINE))[1], on_disk)
+    thinned, _ = subject.clouds(Column("uneven", FINE, uneven=True))
+    assert 0.3 * len(subject.clean) < len(thinned) < 0.8 * len(subject.clean)
+
+
+def test_meshes_are_sampled(data: Path) -> None:
+    (subject,) = load_meshes(data / "meshes", points=500)
+    assert len(subject.clean) == 500
+    assert subject.scores(subject.clean, subject.clean)["p2f"] < 1e-9
+
+
+def run(*arguments: object) -> int:
+    return quality.main([str(argument) for argument in arguments])
+
+
+def test_rows_are_what_the_product_does(data: Path, subject: Subject, bundle_folder: Path, engine: Engine) -> None:
+    table = data / "table.json"
+    options = ["--data", data, "--models", bundle_folder, "--classics", "--columns", "0.5 %", "--json", table]
+    assert run(*options) == 0
+    rows = {row["method"]: row for row in json.loads(table.read_text())["rows"]}
+    clean, noisy = subject.clouds(Column("0.5 %", FINE))
+    assert set(rows) == {"noisy", "limit", "tiny 1", "tiny 2", "tiny 4", "tiny auto"}
+    for name, iterations in (("tiny 1", 1), ("tiny 2", 2), ("tiny 4", 4), ("tiny auto", "auto")):
+        filtered, report = filter_cloud(PointCloud(noisy.copy()), engine, iterations=iterations)
+        assert rows[name]["passes"] == report.iterations
+        for figure, value in subject.scores(clean, filtered.xyz).items():
+            assert rows[name][figure] == pytest.approx(value, rel=1e-4)
+    assert rows["limit"]["p2f"] < 1e-9 < rows["noisy"]["p2f"]
+    (mean,) = [row for row in json.loads(table.read_text())["means"] if row["method"] == "noisy"]
+    assert mean["cd"] == rows["noisy"]["cd"]
+
+
+def test_it_goes_on_where_it_stopped(
+    data: Path, bundle_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = data / "table.json"
+    options = ["--data", data, "--classics", "--columns", "0.5 %", "impulsive 0.5 %", "--json", table]
+    assert run(*options, "--models") == 0
+    first = json.loads(table.read_text())["rows"]
+    assert run(*options, "--models", bundle_folder) == 0
+    second = json.loads(table.read_text())["rows"]
+    assert second[: len(first)] == first
+    assert len(second) == 3 * len(first)
+    monkeypatch.setattr(quality, "filter_points", None)
+    capsys.readouterr()
+    assert run(*options, "--models", bundle_folder) == 0
+    assert json.loads(table.read_text())["rows"] == second
+    printed = capsys.readouterr().out
+    assert "mean of 1" in printed
+    assert printed.count("tiny auto") == 4
+
+
+def test_without_data_it_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--data", tmp_path) == 2
+    assert "POINTFILTER_BENCHMARK_DATA" in capsys.readouterr().err
