@@ -122,8 +122,8 @@ def filter_points(
     input, and kept for all iterations. iterations: a number, or "auto" for as many as the cloud needs (PASSES); a clean
     one comes back as it was. patch_points: N, what the network was trained with. seed: of the downsampling.
     threads: how many batches are evaluated at once; the result does not depend on it. progress(done, total) is called
-    from this thread, in units of points times iterations, from 0 on. cancelled() is asked between batches, from any thread.
-    after_pass(passes, points) sees the cloud as it is after every pass.
+    from this thread, in units of points times iterations, from 0 on. cancelled() is asked between batches, from any
+    thread. after_pass(passes, points) sees the cloud as it is after every pass.
 
     Raises TooFewPointsError, DegenerateCloudError, ParameterError, FilteringCancelledError.
     """
