@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from functools import partial
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request
-from pydantic import Field
 from starlette.responses import Response
 
 from pointfilter.errors import ParameterError
-from pointfilter.models import Auto
+from pointfilter.models import AUTO, Auto
 from pointfilter.pipeline import Radius
 from service.dependencies import AdmittedFolder, ExchangeDep, HouseDep, Ready
 from service.download import FileDownload, content_disposition
@@ -78,8 +78,12 @@ async def filter_file(
     folder: AdmittedFolder,
     model: Annotated[str | None, Query(description="A name from /models", max_length=100)] = None,
     iterations: Annotated[
-        Annotated[int, Field(ge=1)] | Auto | None,
-        Query(description="Passes over the cloud, or auto for as many as it needs; by default the model's"),
+        str | None,
+        Query(
+            description="Passes over the cloud, a number from 1 on, or auto for as many as it needs; by default the "
+            "model's",
+            json_schema_extra={"pattern": "^(auto|[1-9][0-9]*)$"},
+        ),
     ] = None,
     radius: Annotated[
         str | None,
@@ -142,7 +146,7 @@ async def _order(
     house: House,
     exchange: Exchange,
     model: str | None,
-    iterations: int | Auto | None,
+    iterations: str | None,
     radius: str | None,
     seed: int,
     encoding: str,
@@ -150,20 +154,28 @@ async def _order(
     """Checks what can be checked before the upload. Raises ParameterError, ModelError."""
     bundle = await asyncio.to_thread(house.engines.bundle, model or house.settings.model)
     exchange.model = bundle.name
-    if isinstance(iterations, int) and iterations > house.settings.max_iterations:
-        raise ParameterError(
-            f"iterations must be from 1 to {house.settings.max_iterations}, got {iterations}",
-            limit=house.settings.max_iterations,
-            actual=iterations,
-            hint=f"whoever runs the service can raise {variable('max_iterations')}",
-        )
     return Order(
         model=model or house.settings.model,
-        iterations=iterations,
+        iterations=None if iterations is None else _iterations(iterations, house.settings.max_iterations),
         radius=None if radius is None else Radius.parse(radius),
         seed=seed,
         encoding=encoding,
     )
+
+
+def _iterations(text: str, most: int) -> int | Auto:
+    """Raises ParameterError."""
+    if text == AUTO:
+        return AUTO
+    number = int(text) if re.fullmatch(r"-?[0-9]{1,9}", text) else None
+    if number is None or not 1 <= number <= most:
+        raise ParameterError(
+            f"iterations must be auto or a number from 1 to {most}, got {text[:40]}",
+            limit=most,
+            actual=text[:40] if number is None else number,
+            hint=f"whoever runs the service can raise {variable('max_iterations')}",
+        )
+    return number
 
 
 def _server_timing(delivery: Delivery, waited: float) -> str:

@@ -65,6 +65,12 @@ def test_bad_files(client: TestClient, temp_dir: Path, name: str, as_form: bool)
     assert list(temp_dir.iterdir()) == []
 
 
+@pytest.mark.parametrize("asked", ["two", "0", "11", "1.5", "", "9" * 50])
+def test_iterations_are_a_word_or_a_number(client: TestClient, ply: bytes, asked: str) -> None:
+    detail = check(client.post(f"/filter?iterations={asked}", content=ply), 422, "parameter-out-of-range")["detail"]
+    assert detail == f"iterations must be auto or a number from 1 to 10, got {asked[:40]}"
+
+
 @pytest.mark.parametrize("query", PARAMETERS)
 def test_bad_parameters(client: TestClient, ply: bytes, query: str) -> None:
     check(client.post(f"/filter?{query}", content=ply), *PARAMETERS[query])
