@@ -273,8 +273,12 @@ def trained_network(state: dict[str, Any]) -> Pointfilter:
 
 
 def training_record(state: dict[str, Any]) -> dict[str, Any]:
-    """How the weights of a checkpoint came about, the runs that they started from included, the first one first."""
-    settings = state["settings"]
+    """How the weights of a checkpoint came about, the runs that they started from included, the first one first.
+
+    Of a bundle that filtered clouds for it only the name is told: where it lay is nobody's business.
+    """
+    data = state["settings"]["data"]
+    settings = {**state["settings"], "data": {**data, "filtered_by": Path(data.get("filtered_by", "")).name}}
     return {
         "settings": settings,
         "steps": state["step"],

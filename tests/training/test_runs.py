@@ -14,7 +14,7 @@ import torch
 from training import train as train_module
 from training.dataset import Batch, TrainingCloud
 from training.losses import filtering_loss
-from training.train import Run, TrainingSettings, predictor, start
+from training.train import Run, TrainingSettings, predictor, start, training_record
 
 
 def weights(run: Run) -> dict[str, torch.Tensor]:
@@ -182,6 +182,13 @@ def test_weights_may_be_taken_over(tmp_path: Path, straight: Run, tiny: Training
     third = start(tmp_path / "third", tiny, init=checkpoint(run), until=0)
     assert [record["settings"]["seed"] for record in third.before] == [tiny.seed, 5]
     assert Run(third.folder, tiny, resume=True).before == third.before
+
+
+def test_a_record_names_no_folder(straight: Run) -> None:
+    state = checkpoint(straight)
+    state["settings"]["data"]["filtered_by"] = str(Path("my", "private", "bundle"))
+    assert training_record(state)["settings"]["data"]["filtered_by"] == "bundle"
+    assert state["settings"]["data"]["filtered_by"] == str(Path("my", "private", "bundle"))
 
 
 def test_a_narrower_network_grows(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
