@@ -9,7 +9,7 @@ method is a small frozen dataclass of its settings, called with (n, 3) float64 p
 bounding-box diagonal; `neighbours` counts points, where CGAL wants counts.
 
 The settings are told the noise level and were tuned on clouds that the benchmark measures on: an advantage that these
-methods have over a network, on purpose. DIR: see `benchmarks.quality`.
+methods have over a network, on purpose. DIR: the folder `paper4` of the data of `benchmarks.quality`.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from export.bundle import ParityError, write_bundle
 from export.checkpoint import load_checkpoint
-from pointfilter.models import AUTO
+from pointfilter.models import AUTO, parse_iterations
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -32,7 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--version", default="0", help="of the weights, kept in model.json (default: %(default)s)")
     parser.add_argument(
         "--iterations",
-        type=lambda text: AUTO if text == AUTO else int(text),
+        type=parse_iterations,
         default=AUTO,
         metavar="N",
         help="default of the bundle: a number of passes, or auto (default: %(default)s)",

@@ -28,7 +28,14 @@ from pointfilter.engine import DEVICES, Engine, available_cpus
 from pointfilter.evaluation import evaluate
 from pointfilter.formats import FORMATS, format_of
 from pointfilter.formats.ply_header import ENCODINGS
-from pointfilter.models import AUTO, DEFAULT_MODEL, Auto, available_models, find_model, load_bundle, open_model
+from pointfilter.models import (
+    DEFAULT_MODEL,
+    available_models,
+    find_model,
+    load_bundle,
+    open_model,
+    parse_iterations,
+)
 from pointfilter.noise import bounding_box_diagonal
 from pointfilter.pipeline import Radius, Report, filter_cloud
 
@@ -71,7 +78,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     command.add_argument(
         "--iterations",
-        type=_iterations,
+        type=parse_iterations,
         metavar="N",
         help="passes over the cloud, or auto for as many as it needs (default: the model's)",
     )
@@ -132,10 +139,6 @@ def _filter(options: argparse.Namespace) -> int:
         elif not options.quiet:
             print(_summary(source, target, report), file=sys.stderr)
     return 0
-
-
-def _iterations(text: str) -> int | Auto:
-    return AUTO if text == AUTO else int(text)
 
 
 def model_folders() -> list[Path]:

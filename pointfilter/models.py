@@ -37,6 +37,11 @@ _RANGES = {"patch_points": (1, 2**16), "radius": (1e-9, 1.0), "iterations": (1, 
 _WORDS = {"iterations": AUTO}  # what may stand in the place of a number
 
 
+def parse_iterations(text: str) -> int | Auto:
+    """A number of iterations or "auto", as options spell it. Raises ValueError; the range is the filter's business."""
+    return AUTO if text == AUTO else int(text)
+
+
 @dataclass(frozen=True)
 class ModelBundle:
     """One model: its folder and what its model.json says."""
