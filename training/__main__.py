@@ -14,13 +14,19 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 # glibc gives large blocks back to the system at every free and faults them in again at every step; keeping them more
 # than doubles the throughput of training on a CPU. Read at process start, hence the exec.
 MALLOC_SETTINGS = {"MALLOC_MMAP_THRESHOLD_": "4000000000", "MALLOC_TRIM_THRESHOLD_": "8000000000"}
+
+STOPPED = 130  # the exit status of a run that a signal ended
 
 
 def parser() -> argparse.ArgumentParser:
@@ -75,6 +81,24 @@ def _checkpoint(path: Path) -> dict[str, Any]:
     return state
 
 
+@contextmanager
+def _stopping() -> Iterator[Callable[[], bool]]:
+    """Within it SIGTERM and SIGINT end nothing: what it gives says whether one has come. A second SIGINT does end it."""
+    seen = threading.Event()
+
+    def note(number: int, _frame: object) -> None:
+        seen.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        print(f"\n{signal.Signals(number).name}: stopping after this batch", file=sys.stderr)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield seen.is_set
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def main(arguments: list[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     from training.presets import load_preset
@@ -89,21 +113,26 @@ def main(arguments: list[str] | None = None) -> int:
             raise FileNotFoundError(f"--resume: no checkpoint.pt in {folder}")
         settings = load_preset(options.preset, overrides)
         init = _checkpoint(options.init) if options.init else None
-        run = start(
-            folder,
-            settings,
-            resume=options.resume,
-            meshes=options.meshes,
-            clouds=options.clouds,
-            init=init,
-            until=options.until,
-        )
+        with _stopping() as stopped:
+            run = start(
+                folder,
+                settings,
+                resume=options.resume,
+                meshes=options.meshes,
+                clouds=options.clouds,
+                init=init,
+                until=options.until,
+                stop=stopped,
+            )
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"stopped; go on with --out {folder} --resume", file=sys.stderr)
-        return 130
+        print("stopped between two checkpoints", file=sys.stderr)
+        return STOPPED
+    if run.step < min(options.until or run.settings.steps, run.settings.steps):
+        print(f"stopped at step {run.step}; go on with --out {folder} --resume", file=sys.stderr)
+        return STOPPED
     print(f"{run.step} steps, {run.seconds / 3600:.2f} h: {folder / 'checkpoint.pt'}")
     return 0
 

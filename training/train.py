@@ -7,6 +7,7 @@ import dataclasses
 import json
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -171,8 +172,10 @@ class Run:
                 writer.writerows(self.history)
             partial.replace(self.folder / "log.csv")
 
-    def train(self, clouds: list[TrainingCloud], until: int | None = None) -> None:
-        """Trains to the last step, or stops (with a checkpoint) after step `until`."""
+    def train(
+        self, clouds: list[TrainingCloud], until: int | None = None, stop: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Trains to the last step, or stops (with a checkpoint) after step `until` or when stop() says so."""
         settings = self.settings
         last = settings.steps if until is None else min(until, settings.steps)
         bfloat16 = _use_bfloat16(settings.precision)
@@ -182,6 +185,8 @@ class Run:
         spent = self.seconds
         progress = tqdm(initial=self.step, total=settings.steps, unit="batch", smoothing=0.05)
         for batch in batches_ahead(clouds, settings.data, self.step, last):
+            if stop():
+                break
             with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
                 displacements = self.network(batch.patches)
             loss = filtering_loss(
@@ -307,11 +312,13 @@ def start(
     clouds: Path | None = None,
     init: dict[str, Any] | None = None,
     until: int | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Run:
-    """Starts or resumes a run and trains it to its end (or to step `until`).
+    """Starts or resumes a run and trains it to its end (or to step `until`, or until stop(), asked between batches).
 
     init: the checkpoint where the weights come from; a narrower network grows into the one of the settings. Raises
-    ValueError where it cannot, FileExistsError where the folder holds another run.
+    ValueError where it cannot, FileExistsError where the folder holds another run, KeyboardInterrupt when stopped
+    before the first batch.
     """
     first = None if init is None else trained_network(init)
     if resume:
@@ -328,12 +335,16 @@ def start(
         run.source = {name: str(path.absolute()) for name, path in (("meshes", meshes), ("clouds", clouds)) if path}
     meshes, clouds = (Path(run.source[name]) if name in run.source else None for name in ("meshes", "clouds"))
     total = None if clouds else settings.data.clouds
-    pool = list(tqdm(training_clouds(settings.data, meshes, clouds), total=total, unit="cloud", desc="clouds"))
+    pool: list[TrainingCloud] = []
+    for cloud in tqdm(training_clouds(settings.data, meshes, clouds), total=total, unit="cloud", desc="clouds"):
+        if stop():
+            raise KeyboardInterrupt
+        pool.append(cloud)
     if init is not None and first is not None:
         if first.settings != settings.network:
             typical = cut_batch(pool, dataclasses.replace(settings.data, batch=GROWTH_PATCHES), 0).patches
             first = grow(first, settings.network, typical)
         record = training_record(init)
         run.start_from(first, [*record.pop("before"), record])
-    run.train(pool, until)
+    run.train(pool, until, stop)
     return run

@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from torch.optim.swa_utils import AveragedModel
 
 from tests.training.conftest import TINY
 from training import __main__ as command
@@ -118,6 +121,41 @@ def test_the_command_trains_stops_and_goes_on(tmp_path: Path, capsys: pytest.Cap
     assert command.main(["--out", str(tmp_path / "run"), "--resume"]) == 0
     assert "12 steps" in capsys.readouterr().out
     assert train(tmp_path / "other", "--init", tmp_path / "run" / "checkpoint.pt", "--until", 1) == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_a_run_with_a_checkpoint(
+    number: signal.Signals, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = signal.getsignal(number)
+
+    def update(network: AveragedModel, parameters: torch.nn.Module) -> None:
+        if network.n_averaged == 2:
+            signal.raise_signal(number)
+        original(network, parameters)
+
+    original = AveragedModel.update_parameters
+    with monkeypatch.context() as patch:
+        patch.setattr(AveragedModel, "update_parameters", update)
+        assert train(tmp_path / "run") == command.STOPPED
+    assert "stopped at step 3" in capsys.readouterr().err
+    assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["step"] == 3
+    assert signal.getsignal(number) is before
+    assert command.main(["--out", str(tmp_path / "run"), "--resume"]) == 0
+
+
+def test_a_signal_before_the_first_batch_leaves_no_checkpoint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def clouds(*_: object) -> Iterator[None]:
+        yield None
+        signal.raise_signal(signal.SIGTERM)
+        yield None
+
+    monkeypatch.setattr("training.train.training_clouds", clouds)
+    assert train(tmp_path / "run") == command.STOPPED
+    assert "stopped" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "checkpoint.pt").exists()
 
 
 @pytest.mark.parametrize(
