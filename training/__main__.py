@@ -83,7 +83,7 @@ def _checkpoint(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def _stopping() -> Iterator[Callable[[], bool]]:
-    """Within it SIGTERM and SIGINT end nothing: what it gives says whether one has come. A second SIGINT does end it."""
+    """Within it SIGTERM and SIGINT end nothing; what it gives says whether one came. A second SIGINT does end it."""
     seen = threading.Event()
 
     def note(number: int, _frame: object) -> None:
