@@ -3,6 +3,7 @@
     python -m benchmarks.quality --data DIR                          # every bundle, classic and column: hours
     python -m benchmarks.quality --data DIR --models pointfilter-fast --classics --columns '0.5 %' '1 %'
     python -m benchmarks.quality --data DIR --json scores.json       # keeps every row; goes on where it stopped
+    python -m benchmarks.quality --data DIR --classics --patch-points 64 128 256     # the curve over points a patch
 
 DIR holds paper4/ (clean clouds NAME.npy, noisy copies NAME_0.005.npy, surfaces mesh/*.ply) and meshes/*.ply; either may
 be missing. The data is not part of this repository: --data or POINTFILTER_BENCHMARK_DATA says where it lies.
@@ -15,6 +16,7 @@ CD ×1e5, P2F ×1e3, both for a clean cloud scaled to a diagonal of 1 (§4.3); e
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import os
 import sys
@@ -33,7 +35,7 @@ from pointfilter.engine import Engine
 from pointfilter.errors import FilteringCancelledError
 from pointfilter.filtering import filter_points
 from pointfilter.metrics import closest_on_surface
-from pointfilter.models import available_models, open_model
+from pointfilter.models import ModelBundle, available_models, open_model
 from pointfilter.noise import bounding_box_diagonal
 
 Float64 = NDArray[np.float64]
@@ -55,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
         "paper": load_clouds(folders[0]) if folders[0].is_dir() else [],
         "meshes": load_meshes(folders[1]) if folders[1].is_dir() else [],
     }
-    engines = [Engine(open_model(name)) for name in options.models]
+    engines = [Engine(bundle) for name in options.models for bundle in _lengths(open_model(name), options.patch_points)]
     for name, reason in classics.available().items():
         if name in options.classics and reason:
             print(f"left out: {name}: {reason}", file=sys.stderr)
@@ -84,9 +86,24 @@ def _parser() -> argparse.ArgumentParser:
         "--columns", nargs="+", default=columns, choices=columns, metavar="NAME", help=", ".join(columns)
     )
     parser.add_argument(
+        "--patch-points",
+        type=int,
+        nargs="+",
+        default=[],
+        metavar="N",
+        help="measure every bundle with at most so many points a patch too",
+    )
+    parser.add_argument(
         "--json", type=Path, help="keep the rows there; those of the same weights are not measured again"
     )
     return parser
+
+
+def _lengths(bundle: ModelBundle, patch_points: Iterable[int]) -> Iterator[ModelBundle]:
+    """The bundle, and the same one with other lengths of patch, named NAME@LENGTH."""
+    yield bundle
+    for length in patch_points:
+        yield dataclasses.replace(bundle, name=f"{bundle.name}@{length}", patch_points=length)
 
 
 def _rows(

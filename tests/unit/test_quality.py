@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -14,6 +15,7 @@ pytest.importorskip("trimesh", reason="the benchmarks extra is not installed")
 from benchmarks import quality
 from benchmarks.subjects import COLUMNS, Column, Subject, load_clouds, load_meshes
 from pointfilter import Engine, PointCloud, filter_cloud
+from pointfilter.models import load_bundle
 from pointfilter.noise import add_noise
 from tests.clouds import crease
 
@@ -131,6 +133,18 @@ def test_it_goes_on_where_it_stopped(
     printed = capsys.readouterr().out
     assert "mean of 1" in printed
     assert printed.count("tiny auto") == 4
+
+
+def test_other_lengths_of_patch_are_rows_of_their_own(data: Path, bundle_folder: Path, subject: Subject) -> None:
+    table = data / "table.json"
+    options = ["--data", data, "--models", bundle_folder, "--classics", "--columns", "0.5 %", "--json", table]
+    assert run(*options, "--patch-points", 8) == 0
+    rows = {row["method"]: row for row in json.loads(table.read_text())["rows"]}
+    short = dataclasses.replace(load_bundle(bundle_folder), patch_points=8)
+    clean, noisy = subject.clouds(Column("0.5 %", FINE))
+    filtered, _ = filter_cloud(PointCloud(noisy.copy()), Engine(short), iterations=1)
+    assert rows["tiny@8 1"]["cd"] == pytest.approx(subject.scores(clean, filtered.xyz)["cd"], rel=1e-4)
+    assert rows["tiny@8 1"]["cd"] != rows["tiny 1"]["cd"]
 
 
 def test_without_data_it_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
