@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 import tempfile
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,26 +16,41 @@ import torch
 from numpy.typing import NDArray
 
 from export.checkpoint import Loaded
-from export.graph import OPSET, build
+from export.graph import OPSET, build, encoder_ranges
 from pointfilter.filtering import MAX_ITERATIONS
 from pointfilter.models import AUTO, FRAME, NAME, NAME_RULE, SCHEMA, Auto, ModelBundle, load_bundle
 from pointfilter.patches import NeighbourIndex, stable_ids
+from training.dataset import DataSettings, TrainingCloud, cut_batch, training_clouds
 
 PARITY_TOLERANCE = 1e-5  # of the radius
+ROUNDING_TOLERANCE = 0.05  # of the mean displacement: what int8 may change of it, on average
+CALIBRATION_CLOUDS = 32
+CALIBRATION_PATCHES = 2048
+CALIBRATION_SEED = 77
 
 
 class ParityError(RuntimeError):
     """torch and onnxruntime disagree, so nothing was exported."""
 
 
+class RoundingError(RuntimeError):
+    """int8 changes what the network answers by more than it may, so nothing was exported."""
+
+
 def write_bundle(
-    loaded: Loaded, folder: Path, version: str, iterations: int | Auto = AUTO, scores: dict[str, Any] | None = None
+    loaded: Loaded,
+    folder: Path,
+    version: str,
+    iterations: int | Auto = AUTO,
+    scores: dict[str, Any] | None = None,
+    int8: bool = False,
 ) -> tuple[ModelBundle, float]:
     """Writes the bundle folder (its name is the model's name), whole or not at all but for the instant between two
     renames when it takes the place of an older one.
 
-    Returns the bundle as the service will load it, and the parity error. Raises ParityError above PARITY_TOLERANCE,
-    ValueError where the folder is there and is no bundle.
+    int8: with the encoder's products in 8-bit integers, see graph.py. Returns the bundle as the service will load it,
+    and the parity error (of the float32 graph). Raises ParityError above PARITY_TOLERANCE, RoundingError above
+    ROUNDING_TOLERANCE, ValueError where the folder is there and is no bundle.
     """
     if iterations != AUTO and not 1 <= iterations <= MAX_ITERATIONS:
         raise ValueError(f"iterations must be from 1 to {MAX_ITERATIONS}, got {iterations}")
@@ -44,11 +60,18 @@ def write_bundle(
             raise ValueError(f"{what} must be {NAME_RULE}, not {text!r}")
     if folder.exists() and not _is_bundle(folder):
         raise ValueError(f"{folder} is there and is no bundle: choose another name, nothing is overwritten")
-    model = build(loaded.network)
-    serialised = model.SerializeToString()
+    serialised = build(loaded.network).SerializeToString()
     error = parity_error(loaded, serialised)
     if not error <= PARITY_TOLERANCE:
         raise ParityError(f"torch and onnxruntime differ by {error:.3g} of the radius, more than {PARITY_TOLERANCE:g}")
+    rounding = 0.0
+    if int8:
+        exact = serialised
+        serialised, rounding = _rounded(loaded, exact)
+        if not rounding <= ROUNDING_TOLERANCE:
+            raise RoundingError(
+                f"int8 changes displacements by {rounding:.3g} of their length, more than {ROUNDING_TOLERANCE:g}"
+            )
     settings = loaded.network.settings
     described = {
         "schema": SCHEMA,
@@ -66,7 +89,9 @@ def write_bundle(
             "decoder": list(settings.decoder),
             "norm_after_pool": settings.norm_after_pool,
         },
+        "precision": "int8" if int8 else "float32",
         "parity_error": error,
+        "rounding_error": rounding,
         "training": loaded.training,
         "scores": scores or {},
     }
@@ -80,6 +105,37 @@ def write_bundle(
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return load_bundle(folder), error
+
+
+def _rounded(loaded: Loaded, exact: bytes) -> tuple[bytes, float]:
+    """The int8 graph, and by how much it changes displacements of other patches, as a share of their mean length."""
+    calibration, others = (typical_patches(loaded.patch_points, step) for step in (0, 1))
+    serialised = build(loaded.network, encoder_ranges(loaded.network, calibration)).SerializeToString()
+    expected, answers = (
+        onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"]).run(None, {"patches": others})[0]
+        for graph in (exact, serialised)
+    )
+    lengths = np.linalg.norm(expected, axis=1)
+    return serialised, float(np.linalg.norm(answers - expected, axis=1).mean() / max(lengths.mean(), 1e-12))
+
+
+@cache
+def _calibration_clouds() -> list[TrainingCloud]:
+    """Clouds of every noise level and of densities that do not matter much here, so few points."""
+    settings = DataSettings(
+        clouds=CALIBRATION_CLOUDS, fewest_points=5_000, most_points=50_000, clean_points=5_000, seed=CALIBRATION_SEED
+    )
+    return list(training_clouds(settings))
+
+
+def typical_patches(patch_points: int, step: int) -> NDArray[np.float32]:
+    """CALIBRATION_PATCHES patches of procedural shapes at every noise level: (B, patch_points, 3); others a step."""
+    clouds = _calibration_clouds()
+    settings = DataSettings(
+        batch=CALIBRATION_PATCHES, clouds_per_batch=CALIBRATION_CLOUDS, patch_points=patch_points, clean_patch_points=1
+    )
+    patches: NDArray[np.float32] = cut_batch(clouds, settings, step).patches.numpy()
+    return patches
 
 
 def _is_bundle(folder: Path) -> bool:

@@ -5,10 +5,16 @@
 
 The last encoder layer's bias and ReLU come after the max: both are the same for all points and never decreasing, so the
 result is the same and N times less is added and compared.
+
+An int8 graph rounds what goes into the encoder's products from the second layer on to 256 levels, and their weights to
+127 levels a channel. It is written with QuantizeLinear and DequantizeLinear, which every provider knows; onnxruntime
+turns them into products of integers. Everything else stays in float32: the first layer has three inputs, the decoder
+runs once a patch.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +27,10 @@ from training.network import Pointfilter
 
 OPSET = 17
 IR_VERSION = 8
+LARGEST_BIAS = 2.0**30  # in units of the products' sums, which are 32-bit
+LEVELS = 255  # of an unsigned activation above 0
+WEIGHT_LEVELS = 63  # of a signed weight on each side of 0: sums of two products fit 16 bits, which older CPUs need
+RARE = 5e-5  # share of the values that are cut off in an int8 graph
 
 Float64 = NDArray[np.float64]
 
@@ -56,20 +66,63 @@ class _Graph:
         self.nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
 
-    def gemm(self, value: str, matrix: Float64, bias: Float64 | None, name: str) -> str:
+    def product(self, value: str, matrix: Float64, bias: Float64 | None, name: str) -> str:
         inputs = [value, self.constant(f"{name}_weight", matrix.astype(np.float32))]
-        if bias is not None:
-            inputs.append(self.constant(f"{name}_bias", bias.astype(np.float32)))
+        if bias is None:
+            return self.node("MatMul", inputs, name)
+        return self.node("Gemm", [*inputs, self.constant(f"{name}_bias", bias.astype(np.float32))], name)
+
+    def int8_product(self, value: str, largest: float, matrix: Float64, bias: Float64 | None, name: str) -> str:
+        """The product with a value >= 0, which is cut off at `largest`, in integers: u8 × s8, summed in 32 bits."""
+        scale = np.float32(largest / LEVELS)
+        value = self._rounded(value, scale, f"{name}_input")
+        largest_bias = 0.0 if bias is None else np.abs(bias) / LARGEST_BIAS / scale
+        scales = np.maximum(np.abs(matrix).max(axis=0) / WEIGHT_LEVELS, largest_bias).astype(np.float32)
+        scales = np.where(scales > 0, scales, np.float32(1))
+        inputs = [value, self._integers(np.round(matrix / scales).astype(np.int8), scales, 1, f"{name}_weight")]
+        if bias is None:
+            return self.node("MatMul", inputs, name)
+        steps = scale * scales  # of the sums, so also of what is added to them
+        inputs.append(self._integers(np.round(bias / steps).astype(np.int32), steps, 0, f"{name}_bias"))
         return self.node("Gemm", inputs, name)
 
+    def _rounded(self, value: str, scale: np.float32, name: str) -> str:
+        constants = [
+            self.constant(f"{name}_scale", np.array(scale)),
+            self.constant(f"{name}_zero", np.array(np.uint8(0))),
+        ]
+        integers = self.node("QuantizeLinear", [value, *constants], f"{name}_u8")
+        return self.node("DequantizeLinear", [integers, *constants], name)
 
-def build(network: Pointfilter) -> onnx.ModelProto:
-    """The graph of a network in inference mode; batch and patch length are dynamic."""
+    def _integers(self, values: NDArray[np.generic], scales: NDArray[np.float32], axis: int, name: str) -> str:
+        """Constants that are integers times a scale a channel."""
+        zeros = np.zeros(len(scales), values.dtype)
+        inputs = [
+            self.constant(f"{name}_{values.dtype}", values),
+            self.constant(f"{name}_scale", scales),
+            self.constant(f"{name}_zero", zeros),
+        ]
+        return self.node("DequantizeLinear", inputs, name, axis=axis)
+
+
+def build(network: Pointfilter, ranges: Sequence[float] = ()) -> onnx.ModelProto:
+    """The graph of a network in inference mode; batch and patch length are dynamic.
+
+    ranges: makes it an int8 graph: the largest output of each encoder layer but the last that is told apart from larger
+    ones, see `encoder_ranges`.
+    """
     graph = _Graph()
+
+    def product(number: int, value: str, matrix: Float64, bias: Float64 | None) -> str:
+        name = f"encoder{number}"
+        if ranges and number > 0:
+            return graph.int8_product(value, ranges[number - 1], matrix, bias, name)
+        return graph.product(value, matrix, bias, name)
+
     rows = graph.node("Reshape", ["patches", graph.constant("rows_shape", np.array([-1, 3], np.int64))], "rows")
     *inner, (layer, norm) = network.encoder_layers()
     for number, pair in enumerate(inner):
-        rows = graph.node("Relu", [graph.gemm(rows, *_folded(*pair), f"encoder{number}")], f"encoder{number}_relu")
+        rows = graph.node("Relu", [product(number, rows, *_folded(*pair))], f"encoder{number}_relu")
     if network.settings.norm_after_pool:
         matrix, (scale, shift) = _array(layer.weight).T, _affine(norm)
         shift = shift + _array(layer.bias) * scale
@@ -78,7 +131,7 @@ def build(network: Pointfilter) -> onnx.ModelProto:
         behind = np.where(flipped, scale, 1.0)
     else:
         (matrix, shift), behind = _folded(layer, norm), np.ones(1)
-    rows = graph.gemm(rows, matrix, None, f"encoder{len(inner)}")
+    rows = product(len(inner), rows, matrix, None)
     # (B·N, C) -> (B, N, C): the first two sizes are those of the input.
     size = graph.node("Shape", ["patches"], "patches_shape")
     leading = graph.node(
@@ -96,9 +149,9 @@ def build(network: Pointfilter) -> onnx.ModelProto:
     features = graph.node("Relu", [features], "features")
     for number, pair in enumerate(network.decoder_layers()):
         features = graph.node(
-            "Relu", [graph.gemm(features, *_folded(*pair), f"decoder{number}")], f"decoder{number}_relu"
+            "Relu", [graph.product(features, *_folded(*pair), f"decoder{number}")], f"decoder{number}_relu"
         )
-    head = graph.gemm(features, _array(network.head.weight).T, _array(network.head.bias), "head")
+    head = graph.product(features, _array(network.head.weight).T, _array(network.head.bias), "head")
     graph.node("Tanh", [head], "displacements")
     model = helper.make_model(
         helper.make_graph(
@@ -114,3 +167,14 @@ def build(network: Pointfilter) -> onnx.ModelProto:
     )
     onnx.checker.check_model(model, full_check=True)
     return model
+
+
+def encoder_ranges(network: Pointfilter, patches: NDArray[np.float32]) -> list[float]:
+    """The largest outputs of the encoder's layers but the last on typical patches (B, N, 3), one in 20 000 left out."""
+    rows = patches.reshape(-1, 3).astype(np.float64)
+    ranges = []
+    for pair in network.encoder_layers()[:-1]:
+        matrix, bias = _folded(*pair)
+        rows = np.maximum(rows @ matrix + bias, 0)
+        ranges.append(max(float(np.quantile(rows, 1 - RARE)), 1e-6))
+    return ranges

@@ -285,7 +285,7 @@ def _models(options: argparse.Namespace) -> int:
         print(
             f"{bundle.name}{default}: version {bundle.version}, {bundle.parameters} weights, "
             f"{bundle.patch_points} points a patch, radius {100 * bundle.radius:g} %, "
-            f"{bundle.iterations} iterations, sha256 {bundle.sha256[:12]}"
+            f"{bundle.iterations} iterations, {bundle.precision}, sha256 {bundle.sha256[:12]}"
         )
     return 0
 

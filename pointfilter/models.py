@@ -12,7 +12,7 @@ import json
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -31,9 +31,11 @@ NAME_RULE = "up to 100 letters, digits and . _ + -, the first a letter or digit"
 
 _FIELDS: dict[str, type | tuple[type, ...]] = {
     "schema": int, "name": str, "version": str, "sha256": str, "opset": int, "frame": str, "patch_points": int,
-    "radius": float, "iterations": (int, str), "parameters": int, "network": dict, "training": dict, "scores": dict,
+    "radius": float, "iterations": (int, str), "precision": str, "parameters": int, "network": dict, "training": dict,
+    "scores": dict,
 }  # fmt: skip
 _RANGES = {"patch_points": (1, 2**16), "radius": (1e-9, 1.0), "iterations": (1, 100)}
+PRECISIONS = ("float32", "int8")
 _WORDS = {"iterations": AUTO}  # what may stand in the place of a number
 
 
@@ -57,6 +59,8 @@ class ModelBundle:
     """Default patch radius, as a fraction of the bounding-box diagonal."""
     iterations: int | Auto
     """Default number of iterations, or "auto": as many as the cloud needs (filtering.PASSES)."""
+    precision: str
+    """Of the encoder's products: float32 or int8."""
     parameters: int
     network: dict[str, Any]
     training: dict[str, Any] = field(repr=False)
@@ -68,8 +72,8 @@ class ModelBundle:
 
     def summary(self) -> dict[str, Any]:
         """What `pointfilter models` and GET /models show."""
-        names = ("name", "version", "sha256", "opset", "patch_points", "radius", "iterations", "parameters", "network")
-        return {name: getattr(self, name) for name in (*names, "training", "scores")}
+        names = (field.name for field in fields(self) if field.name != "folder")
+        return {name: getattr(self, name) for name in names}
 
 
 def load_bundle(folder: Path) -> ModelBundle:
@@ -87,6 +91,7 @@ def load_bundle(folder: Path) -> ModelBundle:
     if not isinstance(described, dict) or described.get("schema") != SCHEMA:
         found = described.get("schema") if isinstance(described, dict) else None
         raise InvalidModelError(f"model.json of {folder.name!r} has schema {found!r}, this version reads {SCHEMA}")
+    described.setdefault("precision", PRECISIONS[0])  # bundles from before there were others
     for name, kind in _FIELDS.items():
         if not isinstance(described.get(name), kind):
             raise InvalidModelError(f"model.json of {folder.name!r}: {name!r} is missing or of the wrong type")
@@ -102,6 +107,10 @@ def load_bundle(folder: Path) -> ModelBundle:
     for name in ("name", "version"):
         if not NAME.fullmatch(described[name]):
             raise InvalidModelError(f"{name} {described[name]!r} of model {folder.name!r} must be {NAME_RULE}")
+    if described["precision"] not in PRECISIONS:
+        raise InvalidModelError(
+            f"precision {described['precision']!r} of model {folder.name!r} must be one of {', '.join(PRECISIONS)}"
+        )
     if described["frame"] != FRAME:
         raise InvalidModelError(f"model {folder.name!r} was trained with frames {described['frame']!r}, not {FRAME!r}")
     if described["sha256"] != digest:

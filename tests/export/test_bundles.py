@@ -9,7 +9,7 @@ import torch
 
 from export import __main__ as command
 from export import bundle as bundle_module
-from export.bundle import ParityError, write_bundle
+from export.bundle import ParityError, RoundingError, write_bundle
 from export.checkpoint import Loaded, load_checkpoint
 from pointfilter import Engine, load_bundle
 from training.network import NetworkSettings, Pointfilter
@@ -44,6 +44,48 @@ def test_a_bundle_says_where_it_comes_from(tmp_path: Path) -> None:
     assert bundle.parameters == sum(parameter.numel() for parameter in source.network.parameters())
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["mine"]
     Engine(bundle, "cpu").warm_up()
+
+
+@pytest.fixture
+def typical(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Patches for calibration without shapes to sample."""
+
+    def patches(patch_points: int, step: int) -> np.ndarray:
+        return np.random.default_rng(step).uniform(-1, 1, (256, patch_points, 3)).astype(np.float32)
+
+    monkeypatch.setattr(bundle_module, "typical_patches", patches)
+
+
+def test_an_int8_bundle_answers_nearly_the_same(tmp_path: Path, typical: None) -> None:
+    exact, _ = write_bundle(loaded(), tmp_path / "exact", "1")
+    rounded, _ = write_bundle(loaded(), tmp_path / "rounded", "1", int8=True)
+    assert (exact.precision, rounded.precision) == ("float32", "int8")
+    patches = np.random.default_rng(5).uniform(-1, 1, (100, 32, 3)).astype(np.float32)
+    expected, answers = Engine(exact, "cpu")(patches), Engine(rounded, "cpu")(patches)
+    told = json.loads((rounded.folder / "model.json").read_text())["rounding_error"]
+    found = np.linalg.norm(answers - expected, axis=1).mean() / np.linalg.norm(expected, axis=1).mean()
+    assert 0 < found < 0.05
+    assert told == pytest.approx(found, rel=0.5)
+    assert json.loads((exact.folder / "model.json").read_text())["rounding_error"] == 0
+
+
+def test_int8_that_changes_too_much_leaves_nothing_behind(
+    tmp_path: Path, typical: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bundle_module, "encoder_ranges", lambda *_: [1e-4])
+    with pytest.raises(RoundingError, match=r"more than 0\.05"):
+        write_bundle(loaded(), tmp_path / "mine", "1", int8=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_typical_patches_are_of_every_kind() -> None:
+    first, second = (bundle_module.typical_patches(48, step) for step in (0, 1))
+    assert first.shape == second.shape == (bundle_module.CALIBRATION_PATCHES, 48, 3)
+    assert (first != second).any()
+    assert np.abs(first).max() <= 1
+    thickness = first.std(axis=1)[:, 2]
+    assert thickness.min() < 0.01
+    assert thickness.max() > 0.3
 
 
 def test_a_parity_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -90,6 +90,7 @@ CHANGES: dict[str, Change] = {
             "scores",
         )
     },
+    "a precision that nobody knows": lambda d: d.update(precision="int4"),
     "a version of two lines": lambda d: d.update(version="1\n2"),
     "points as text": lambda d: d.update(patch_points="64"),
     "no points": lambda d: d.update(patch_points=0),
@@ -103,6 +104,11 @@ CHANGES: dict[str, Change] = {
     "radius by itself": lambda d: d.update(radius="auto"),
     "iterations for ever": lambda d: d.update(iterations=10**6),
 }
+
+
+def test_a_bundle_from_before_there_were_precisions(copy: Path) -> None:
+    change(copy, lambda d: d.pop("precision", None))
+    assert load_bundle(copy).precision == "float32"
 
 
 def test_iterations_may_be_left_to_the_cloud(copy: Path) -> None:

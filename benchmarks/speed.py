@@ -1,0 +1,396 @@
+"""Speed of the bundles, of the whole filter and of what they are compared with: one command, one table.
+
+    python -m benchmarks.speed                                       # 10 k, 100 k and 1 M points: about half an hour
+    python -m benchmarks.speed --points 100000 --models pointfilter-fast --classics
+    python -m benchmarks.speed --json speed.json                     # and keep the figures
+    python -m benchmarks.speed --against speed.json                  # ratios to the figures of an earlier run
+
+Every figure is measured in the run that prints it, in a process of its own, so that its peak of memory is its own too.
+Needs no data: the cloud is a ring with sharp edges and 0.5 % noise.
+
+network     real patches of that cloud through the network alone; GFLOP/s count multiplications and additions of its
+            layers; share: of the best sgemm (NumPy's) in the same process, with the same number of threads
+end_to_end  a binary PLY read, filtered twice, written; stages in seconds of the clock (the work of several threads
+            divided by their number); peak: of the process's memory
+naive       research code's way: one patch at a time in Python, then torch in batches of 64; timed on a sample and
+            scaled; with the bundle's own network, and with the paper's network and its 500 points
+classic     of the quality benchmark, tuned for this noise; not beaten: as accurate as the bundle in CD and P2F, and
+            faster
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import itertools
+import json
+import multiprocessing
+import os
+import platform
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from benchmarks import classics
+from benchmarks.subjects import Subject
+from pointfilter.cloud import PointCloud
+from pointfilter.engine import Engine, available_cpus
+from pointfilter.filtering import ROWS_PER_BATCH
+from pointfilter.models import available_models, open_model
+from pointfilter.noise import add_noise, bounding_box_diagonal
+from pointfilter.patches import NeighbourIndex, stable_ids
+from pointfilter.pipeline import filter_cloud
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Figures = dict[str, Any]
+
+NOISE = 0.005
+ITERATIONS = 2
+PAPER = {"encoder": [64, 128, 256, 512, 1024], "decoder": [512, 256]}
+PAPER_POINTS = 500
+NAIVE_SAMPLE = 1024  # points that the naive pipeline is timed on
+NAIVE_BATCH = 64
+CLASSIC_POINTS = 100_000
+SECONDS = 3.0  # how long a rate is measured
+SGEMM_SIZES = (256, 512, 1024, 2048)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    options = _parser().parse_args(arguments)
+    against = json.loads(options.against.read_text()) if options.against else None
+    table: list[Figures] = []
+    for what, values in _plan(options):
+        row = _alone(what, **values)
+        table.append(row)
+        print(_line(row), flush=True)
+    result = {"machine": machine(), "rows": table}
+    for line in [*_ratios(table), *(_compared(result, against) if against else [])]:
+        print(line)
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1) + "\n")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.speed", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--models", nargs="*", default=list(available_models()), help="names or folders of bundles")
+    parser.add_argument("--devices", nargs="+", default=["cpu"], help="see pointfilter filter --help")
+    parser.add_argument("--points", type=int, nargs="*", default=[10_000, 100_000, 1_000_000])
+    parser.add_argument("--threads", type=int, nargs="+", default=sorted({1, available_cpus()}))
+    parser.add_argument("--classics", nargs="*", default=list(classics.available()), help="default: all that are there")
+    parser.add_argument("--json", type=Path, help="write the figures there")
+    parser.add_argument("--against", type=Path, metavar="JSON", help="figures of an earlier run to compare with")
+    return parser
+
+
+def _plan(options: argparse.Namespace) -> Iterator[tuple[Callable[..., Figures], Figures]]:
+    """What is measured, in order."""
+    most = max(options.threads)
+    for model, device, threads in itertools.product(options.models, options.devices, options.threads):
+        yield network, {"model": model, "device": device, "threads": threads}
+    for model, device, points in itertools.product(options.models, options.devices, options.points):
+        yield end_to_end, {"model": model, "device": device, "threads": most, "points": points}
+    if importlib.util.find_spec("torch"):
+        for model in options.models:
+            yield naive, {"model": model, "threads": most}
+        yield naive, {"model": "", "threads": most}
+    else:
+        print("naive: left out, torch is not installed", file=sys.stderr)
+    for method in options.classics:
+        if reason := classics.available()[method]:
+            print(f"{method}: left out: {reason}", file=sys.stderr)
+        else:
+            yield classic, {"method": method}
+
+
+def _alone(measure: Callable[..., Figures], **values: Any) -> Figures:
+    """The figures that `measure` returns in a fresh process, with what they are of."""
+    # NumPy's products stay in the thread that asks for them; threads are ours to count.
+    os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1", MKL_NUM_THREADS="1")
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        figures = pool.submit(measure, **values).result()
+    return {"what": measure.__name__, **values, **figures}
+
+
+# What is measured --------------------------------------------------------------------------------------------------
+
+
+def network(model: str, device: str, threads: int) -> Figures:
+    """Patches a second of the network alone, in batches as the filter makes them, one thread a batch."""
+    bundle = open_model(model)
+    engine = Engine(bundle, device, threads)
+    _, noisy = ring(20_000).clouds_of_noise(NOISE)
+    index, ids = _indexed(noisy, bundle.radius)
+    size = max(1, ROWS_PER_BATCH // bundle.patch_points)
+    batches = [
+        index.patches(noisy[start : start + size], ids[start : start + size], bundle.patch_points, 0).points
+        for start in range(0, 64 * size, size)
+    ]
+    batches = [batch for batch in batches if len(batch) == size]
+    calls = _rate(lambda number: engine(batches[number % len(batches)]), threads)
+    gflops = calls * size * patch_flops(bundle.network, bundle.patch_points) / 1e9
+    best = sgemm(threads)
+    return {
+        "provider": engine.provider,
+        "patch_points": bundle.patch_points,
+        "patches_per_second": calls * size,
+        "gflops": gflops,
+        "sgemm_gflops": best,
+        "share": gflops / best,
+    }
+
+
+def end_to_end(model: str, device: str, threads: int, points: int) -> Figures:
+    """A file in, a file out, with the clock's seconds of every stage and the peak of the process's memory."""
+    bundle = open_model(model)
+    engine = Engine(bundle, device, threads)
+    engine.warm_up()
+    subject = ring(points)
+    clean, noisy = subject.clouds_of_noise(NOISE)
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder, "in.ply"), Path(folder, "out.ply")
+        PointCloud(noisy).write(source)
+        del noisy
+        started = time.perf_counter()
+        cloud = PointCloud.read(source)
+        read = time.perf_counter() - started
+        filtered, report = filter_cloud(cloud, engine, iterations=ITERATIONS)
+        writing = time.perf_counter()
+        filtered.write(target, comment=report.comment)
+        finished = time.perf_counter()
+    memory = peak_memory()  # before the scores, which need memory of their own
+    stages = report.seconds
+    seconds = finished - started
+    infer = stages["infer"] / threads
+    return {
+        "provider": engine.provider,
+        "seconds": seconds,
+        "read": read,
+        "index": stages["index"],
+        "patches": stages["patches"] / threads,
+        "network": infer,
+        "write": finished - writing,
+        "not_network": 1 - infer / seconds,
+        "peak_mb": memory / 1e6,
+        **({name: subject.scores(clean, filtered.xyz)[name] for name in ("cd", "p2f")} if points <= 200_000 else {}),
+    }
+
+
+def naive(model: str, threads: int) -> Figures:
+    """Seconds for 100 k points in research code's way. model "": the paper's network and patches."""
+    import torch
+
+    from training.network import NetworkSettings, Pointfilter
+
+    bundle = open_model(model) if model else None
+    settings = NetworkSettings.from_dict(bundle.network if bundle else {**PAPER, "norm_after_pool": False})
+    length = bundle.patch_points if bundle else PAPER_POINTS
+    torch.set_num_threads(threads)
+    net = Pointfilter(settings).eval()
+    _, points = ring(CLASSIC_POINTS).clouds_of_noise(NOISE)
+    radius = 0.05 * bounding_box_diagonal(points)
+    rng = np.random.default_rng(0)
+    rows = rng.choice(len(points), NAIVE_SAMPLE, replace=False)
+    tree = cKDTree(points)
+    started = time.perf_counter()
+    for start in range(0, len(rows), NAIVE_BATCH):
+        patches, frames = [], []
+        for row in rows[start : start + NAIVE_BATCH]:
+            near = np.array(tree.query_ball_point(points[row], radius))
+            offsets = (points[near] - points[row]) / radius
+            frame = np.linalg.svd(np.cov(offsets.T))[0].T
+            if len(offsets) > length:
+                offsets = offsets[rng.choice(len(offsets), length, replace=False)]
+            patch = np.zeros((length, 3), np.float32)
+            patch[: len(offsets)] = offsets @ frame.T
+            patches.append(patch)
+            frames.append(frame)
+        with torch.inference_mode():
+            answer = net(torch.from_numpy(np.stack(patches))).numpy()
+        points[rows[start : start + NAIVE_BATCH]] += radius * np.einsum("bi,bij->bj", answer, np.stack(frames))
+    seconds = (time.perf_counter() - started) / NAIVE_SAMPLE * CLASSIC_POINTS * ITERATIONS
+    return {"points": CLASSIC_POINTS, "patch_points": length, "sample": NAIVE_SAMPLE, "seconds": seconds}
+
+
+def classic(method: str) -> Figures:
+    """Seconds and accuracy of a classic filter on 100 k points."""
+    subject = ring(CLASSIC_POINTS)
+    clean, noisy = subject.clouds_of_noise(NOISE)
+    started = time.perf_counter()
+    filtered = classics.smooth(method, noisy, NOISE)
+    seconds = time.perf_counter() - started
+    scores = subject.scores(clean, filtered)
+    return {"points": CLASSIC_POINTS, "seconds": seconds, "cd": scores["cd"], "p2f": scores["p2f"]}
+
+
+# How it is measured ------------------------------------------------------------------------------------------------
+
+
+class Ring(Subject):
+    """A ring with a square profile: flat and curved faces that meet in right angles."""
+
+    def clouds_of_noise(self, level: float) -> tuple[Float64, Float64]:
+        """The clean cloud and a noisy copy, row for row."""
+        return self.clean, add_noise(self.clean, level, np.random.default_rng(1))
+
+
+def ring(points: int) -> Ring:
+    """A ring with so many points spread evenly over it."""
+    mesh = trimesh.creation.annulus(r_min=0.3, r_max=0.5, height=0.3, sections=512)
+    clean, _ = trimesh.sample.sample_surface(mesh, points, seed=0)
+    return Ring("ring", np.asarray(clean, np.float64), np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64))
+
+
+def _indexed(points: Float64, fraction: float) -> tuple[NeighbourIndex, NDArray[np.uint64]]:
+    ids = stable_ids(points)
+    return NeighbourIndex(points, fraction * bounding_box_diagonal(points), ids), ids
+
+
+def patch_flops(widths: Figures, points: int) -> float:
+    """Multiplications and additions of the network's products for one patch."""
+    encoder = [3, *widths["encoder"]]
+    decoder = [encoder[-1], *widths["decoder"], 3]
+
+    def products(layers: list[int]) -> int:
+        return sum(a * b for a, b in itertools.pairwise(layers))
+
+    return 2.0 * (points * products(encoder) + products(decoder))
+
+
+def sgemm(threads: int) -> float:
+    """GFLOP/s of NumPy's best float32 product, one in every thread at once."""
+    best = 0.0
+    for size in SGEMM_SIZES:
+        matrices = np.random.default_rng(0).random((threads, size, size), np.float32)
+        products = np.empty_like(matrices)
+
+        def multiply(number: int, matrices: Float32 = matrices, products: Float32 = products) -> None:
+            matrix = matrices[number % threads]
+            np.matmul(matrix, matrix, out=products[number % threads])
+
+        best = max(best, _rate(multiply, threads, SECONDS / len(SGEMM_SIZES)) * 2 * size**3 / 1e9)
+    return best
+
+
+def _rate(call: Callable[[int], object], threads: int, seconds: float = SECONDS) -> float:
+    """Calls a second, `threads` of them at a time, each thread with numbers of its own."""
+
+    def work(first: int, until: float) -> int:
+        done = 0
+        while time.perf_counter() < until:
+            call(first + done * threads)
+            done += 1
+        return done
+
+    with ThreadPoolExecutor(threads) as pool:
+        for duration in (0.2, seconds):  # the first round warms up
+            started = time.perf_counter()
+            counts = [pool.submit(work, number, started + duration) for number in range(threads)]
+            done = sum(count.result() for count in counts)
+            elapsed = time.perf_counter() - started
+    return done / elapsed
+
+
+def peak_memory() -> float:
+    """The most memory that this process has held so far, in bytes. ru_maxrss would know the parent's too."""
+    try:
+        status = Path("/proc/self/status").read_text()
+        return 1024.0 * int(status.partition("VmHWM:")[2].split()[0])
+    except (OSError, IndexError):
+        return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def machine() -> Figures:
+    """What the figures were measured on."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        processor = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        processor = platform.processor()
+    return {
+        "processor": processor,
+        "cpus": available_cpus(),
+        "python": platform.python_version(),
+        "onnxruntime": onnxruntime.__version__,
+        "numpy": np.__version__,
+    }
+
+
+# What is said about it ---------------------------------------------------------------------------------------------
+
+
+def _name(row: Figures) -> str:
+    name = row.get("method") or row.get("model") or "paper's network"
+    return f"{row['what']:11}{name:28}{row.get('device', ''):9}" + (
+        f"{row['threads']} threads  " if "threads" in row else " " * 11
+    )
+
+
+def _line(row: Figures) -> str:
+    if row["what"] == "network":
+        figures = (
+            f"{row['patches_per_second']:8.0f} patches/s of {row['patch_points']} points, {row['gflops']:6.1f} GFLOP/s,"
+            f" {row['share']:.0%} of sgemm's {row['sgemm_gflops']:.1f}"
+        )
+    elif row["what"] == "end_to_end":
+        stages = ", ".join(f"{name} {row[name]:.2f}" for name in ("read", "index", "patches", "network", "write"))
+        figures = (
+            f"{row['points']:8d} points × {ITERATIONS}: {row['seconds']:7.2f} s ({stages}); not the network "
+            f"{row['not_network']:.0%}; peak {row['peak_mb']:.0f} MB"
+        )
+    else:
+        scaled = f", scaled from {row['sample']} points" if "sample" in row else ""
+        figures = f"{row['points']:8d} points: {row['seconds']:8.1f} s{scaled}"
+    return _name(row) + figures + (f"; CD {row['cd']:.3f}, P2F {row['p2f']:.3f}" if "cd" in row else "")
+
+
+def _ratios(table: list[Figures]) -> Iterator[str]:
+    """What the rows say about each other."""
+    runs = [row for row in table if row["what"] == "end_to_end"]
+    for run in (run for run in runs if run["points"] == CLASSIC_POINTS):
+        name = f"{run['model']} ({run['device']})"
+        for other in (row for row in table if row["what"] == "naive" and row["model"] in (run["model"], "")):
+            ratio = other["seconds"] / run["seconds"]
+            yield f"{name}: {ratio:.1f} times as fast as the naive way with {other['model'] or 'the paper’s network'}"
+        for big in runs:
+            if (big["model"], big["device"]) == (run["model"], run["device"]) and big["points"] > run["points"]:
+                slower = big["seconds"] / big["points"] / (run["seconds"] / run["points"])
+                yield f"{name}: a point of {big['points']} takes {slower:.2f} times as long as one of {run['points']}"
+        for other in (row for row in table if row["what"] == "classic"):
+            accurate = other["cd"] <= run["cd"] and other["p2f"] <= run["p2f"]
+            ratio = other["seconds"] / run["seconds"]
+            verdict = "less accurate" if not accurate else "beaten" if ratio > 1 else "NOT BEATEN"
+            yield f"{name}: {other['method']} takes {ratio:.2f} times as long: {verdict}"
+
+
+def _compared(now: Figures, before: Figures) -> Iterator[str]:
+    """Ratios to an earlier run, row for row."""
+    yield f"against {before['machine']}:"
+
+    def key(row: Figures) -> tuple[Any, ...]:
+        return tuple(row.get(name) for name in ("what", "model", "method", "device", "threads", "points"))
+
+    earlier = {key(row): row for row in before["rows"]}
+    for row in now["rows"]:
+        if (old := earlier.get(key(row))) is not None:
+            figure = "patches_per_second" if row["what"] == "network" else "seconds"
+            yield f"{_name(row)}{figure}: {row[figure] / old[figure]:.2f} times what it was"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
