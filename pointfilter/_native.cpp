@@ -18,10 +18,20 @@
 namespace {
 
 constexpr int kKeyBins = 256;      // first digit of the selection by key
+constexpr int kHighestLevel = 40;  // of thinning: one point in 2^40
+constexpr size_t kEnough = 1024;   // points of a ball that are looked at, at least, or four times a patch's length
 constexpr int kJacobiSweeps = 12;  // three are typical, the loop leaves as soon as the matrix is diagonal
 
 // ---------------------------------------------------------------------------------------------------------------
-// The index: points sorted by (cell, id), one entry a non-empty cell.
+// The index: points sorted by (cell, mix(id)), one entry a non-empty cell.
+
+uint64_t mix(uint64_t value) {  // Stafford's variant 13 of the MurmurHash3 finaliser
+  value ^= value >> 30;
+  value *= 0xbf58476d1ce4e5b9ULL;
+  value ^= value >> 27;
+  value *= 0x94d049bb133111ebULL;
+  return value ^ (value >> 31);
+}
 
 struct Index {
   const double* x;
@@ -35,45 +45,77 @@ struct Index {
   double origin[3];
   double edge;
   int64_t shape[3];  // nx, ny, nz
+
+  // The first position in [start, stop), which lie in one cell, whose mixed id is not below `limit`.
+  int64_t not_below(uint64_t limit, int64_t start, int64_t stop) const {
+    while (start < stop) {
+      const int64_t middle = start + (stop - start) / 2;
+      if (mix(ids[middle]) < limit)
+        start = middle + 1;
+      else
+        stop = middle;
+    }
+    return start;
+  }
 };
 
-struct Run {  // a row of cells along x, as one contiguous range of points
-  int64_t start, stop;
-  double y_low, y_high, z_low, z_high;
+struct Cell {
+  int64_t start, end;
+  int64_t stop;  // where the points of the level end
+  double low[3], high[3];
 };
 
-// The runs of points that can lie within `radius` of a centre in one cell. Centres come sorted by cell, so the runs are
-// looked up once a cell and not once a point.
+// What is close to a centre. Centres come sorted by cell, so the cells are looked up once a cell and not once a point.
+//
+// Dense clouds are thinned: level k holds the points whose mixed id starts with k zero bits, about one in 2^k, and a
+// ball gets the highest level that has `enough` points in it. The levels are those of the cloud, so neither the centre's
+// cell nor the cloud's pose has a say in the choice.
 class Neighbourhood {
  public:
   Neighbourhood(const Index& index, double radius) : index_(index), radius_(radius) {}
 
-  // Positions (in the index) of all points p with |p - centre| < radius, in index order.
-  const std::vector<int64_t>& around(const double* centre) {
+  // Positions (in the index) of points p with |p - centre| < radius: all of them, or of those levels that are needed
+  // for `enough`.
+  std::vector<int64_t>& around(const double* centre, size_t enough) {
     locate(centre);
-    members_.clear();
-    const double limit = radius_ * radius_;
-    for (const Run& run : runs_) {
-      const double dy = gap(centre[1], run.y_low, run.y_high);
-      const double dz = gap(centre[2], run.z_low, run.z_high);
-      if (dy * dy + dz * dz >= limit * (1 + 1e-9)) continue;
-      const size_t before = members_.size();
-      members_.resize(before + static_cast<size_t>(run.stop - run.start));
-      int64_t* out = members_.data() + before;
-      size_t found = 0;
-      for (int64_t j = run.start; j < run.stop; ++j) {
-        const double x = index_.x[j] - centre[0], y = index_.y[j] - centre[1], z = index_.z[j] - centre[2];
-        out[found] = j;
-        found += (x * x + y * y + z * z < limit);
-      }
-      members_.resize(before + found);
+    gather(centre, SIZE_MAX);
+    while (level_ > 0 && members_.size() < enough) {
+      set_level(level_ - 1);
+      gather(centre, SIZE_MAX);
     }
+    if (members_.size() >= enough) rise(enough);
     return members_;
+  }
+
+  // The same with the point of this id, if it lies in the centre's cell, among them in any case.
+  std::vector<int64_t>& around(const double* centre, size_t enough, uint64_t id) {
+    around(centre, enough);
+    if (level_ == 0 || home_ == cells_.size() || mix(id) < limit(level_)) return members_;
+    const Cell& home = cells_[home_];
+    const int64_t j = index_.not_below(mix(id), home.start, home.end);
+    if (j < home.end && index_.ids[j] == id && near(centre, j)) members_.push_back(j);
+    return members_;
+  }
+
+  // How many points lie closer than the radius; stops counting at `enough`.
+  size_t count(const double* centre, size_t enough) {
+    locate(centre);
+    set_level(0);
+    gather(centre, enough);
+    return std::min(members_.size(), enough);
   }
 
  private:
   static double gap(double value, double low, double high) {
     return value < low ? low - value : (value > high ? value - high : 0.0);
+  }
+
+  // Mixed ids of a level above 0 are below it.
+  static uint64_t limit(int level) { return uint64_t{1} << (64 - level); }
+
+  bool near(const double* centre, int64_t j) const {
+    const double x = index_.x[j] - centre[0], y = index_.y[j] - centre[1], z = index_.z[j] - centre[2];
+    return x * x + y * y + z * z < radius_ * radius_;
   }
 
   int64_t cell_of(double value, int axis) const {
@@ -82,64 +124,129 @@ class Neighbourhood {
     return static_cast<int64_t>(std::min(std::max(cell, 0.0), last));
   }
 
+  void gather(const double* centre, size_t enough) {
+    members_.clear();
+    const double limit = radius_ * radius_;
+    for (const Cell& cell : cells_) {
+      double squared = 0;
+      for (int axis = 0; axis < 3; ++axis) {
+        const double distance = gap(centre[axis], cell.low[axis], cell.high[axis]);
+        squared += distance * distance;
+      }
+      if (squared >= limit * (1 + 1e-9)) continue;
+      const size_t before = members_.size();
+      members_.resize(before + static_cast<size_t>(cell.stop - cell.start));
+      int64_t* out = members_.data() + before;
+      size_t found = 0;
+      for (int64_t j = cell.start; j < cell.stop; ++j) {
+        const double x = index_.x[j] - centre[0], y = index_.y[j] - centre[1], z = index_.z[j] - centre[2];
+        out[found] = j;
+        found += (x * x + y * y + z * z < limit);
+      }
+      members_.resize(before + found);
+      if (members_.size() >= enough) return;
+    }
+  }
+
+  // Goes up to the highest level that still has `enough` of the members.
+  void rise(size_t enough) {
+    size_t at[65] = {};
+    zeros_.resize(members_.size());
+    for (size_t k = 0; k < members_.size(); ++k) {
+      zeros_[k] = leading_zeros(mix(index_.ids[members_[k]]));
+      ++at[zeros_[k]];
+    }
+    int level = 64;
+    for (size_t total = at[64]; total < enough;) total += at[--level];
+    level = std::min(level, kHighestLevel);
+    if (level <= level_) return;
+    size_t kept = 0;
+    for (size_t k = 0; k < members_.size(); ++k)
+      if (zeros_[k] >= level) members_[kept++] = members_[k];
+    members_.resize(kept);
+    set_level(level);
+  }
+
+  static uint8_t leading_zeros(uint64_t value) {
+    uint8_t zeros = 0;
+    while (zeros < 64 && !(value >> 63)) value <<= 1, ++zeros;
+    return zeros;
+  }
+
+  void set_level(int level) {
+    if (level == level_) return;
+    level_ = level;
+    for (Cell& cell : cells_) set_stop(cell);
+  }
+
+  void set_stop(Cell& cell) const {
+    cell.stop = level_ == 0 ? cell.end : index_.not_below(limit(level_), cell.start, cell.end);
+  }
+
   void locate(const double* centre) {
     std::array<int64_t, 6> box;  // the cells that the ball around any point of the centre's cell touches
+    std::array<int64_t, 3> home;
+    bool inside = true;
     for (size_t axis = 0; axis < 3; ++axis) {
       const int along = static_cast<int>(axis);
       const bool outside = centre[axis] < index_.origin[axis] ||
                            centre[axis] > index_.origin[axis] + index_.edge * static_cast<double>(index_.shape[axis]);
+      home[axis] = cell_of(centre[axis], along);
       if (outside) {
+        inside = false;
         box[axis] = cell_of(centre[axis] - radius_, along);
         box[axis + 3] = cell_of(centre[axis] + radius_, along);
       } else {
-        const int64_t home = cell_of(centre[axis], along);
         const int64_t reach = static_cast<int64_t>(std::ceil(radius_ / index_.edge));
-        box[axis] = std::max<int64_t>(home - reach, 0);
-        box[axis + 3] = std::min<int64_t>(home + reach, index_.shape[axis] - 1);
+        box[axis] = std::max<int64_t>(home[axis] - reach, 0);
+        box[axis + 3] = std::min<int64_t>(home[axis] + reach, index_.shape[axis] - 1);
       }
     }
-    if (valid_ && box == box_) return;
+    if (valid_ && box == box_ && home == home_cell_) return;
     box_ = box;
+    home_cell_ = home;
     valid_ = true;
-    runs_.clear();
+    cells_.clear();
+    const int64_t home_key = inside ? (home[2] * index_.shape[1] + home[1]) * index_.shape[0] + home[0] : -1;
+    size_t home_at = SIZE_MAX;
     const double slack = index_.edge * 1e-6;
     for (int64_t cz = box[2]; cz <= box[5]; ++cz) {
       for (int64_t cy = box[1]; cy <= box[4]; ++cy) {
         const int64_t row = (cz * index_.shape[1] + cy) * index_.shape[0];
         const int64_t* end = index_.cell_keys + index_.cells;
-        const int64_t* first = std::lower_bound(index_.cell_keys, end, row + box[0]);
-        const int64_t* last = std::upper_bound(first, end, row + box[3]);
-        if (first == last) continue;
-        Run run;
-        run.start = index_.cell_starts[first - index_.cell_keys];
-        run.stop = index_.cell_starts[last - index_.cell_keys];
-        run.y_low = index_.origin[1] + index_.edge * static_cast<double>(cy) - slack;
-        run.y_high = run.y_low + index_.edge + 2 * slack;
-        run.z_low = index_.origin[2] + index_.edge * static_cast<double>(cz) - slack;
-        run.z_high = run.z_low + index_.edge + 2 * slack;
-        runs_.push_back(run);
+        const int64_t* key = std::lower_bound(index_.cell_keys, end, row + box[0]);
+        for (; key != end && *key <= row + box[3]; ++key) {
+          const int64_t position[3] = {*key - row, cy, cz};
+          Cell cell;
+          cell.start = index_.cell_starts[key - index_.cell_keys];
+          cell.end = index_.cell_starts[key - index_.cell_keys + 1];
+          for (int axis = 0; axis < 3; ++axis) {
+            cell.low[axis] = index_.origin[axis] + index_.edge * static_cast<double>(position[axis]) - slack;
+            cell.high[axis] = cell.low[axis] + index_.edge + 2 * slack;
+          }
+          set_stop(cell);
+          if (*key == home_key) home_at = cells_.size();
+          cells_.push_back(cell);
+        }
       }
     }
+    home_ = std::min(home_at, cells_.size());
   }
 
   const Index& index_;
   double radius_;
+  int level_ = 0;
   bool valid_ = false;
   std::array<int64_t, 6> box_{};
-  std::vector<Run> runs_;
+  std::array<int64_t, 3> home_cell_{};
+  std::vector<Cell> cells_;
+  size_t home_ = 0;  // the centre's own among them; their number where it is none of them
   std::vector<int64_t> members_;
+  std::vector<uint8_t> zeros_;
 };
 
 // ---------------------------------------------------------------------------------------------------------------
 // Keyed downsampling: every (centre, neighbour) pair has a 64-bit key, the smallest `wanted` keys stay.
-
-uint64_t mix(uint64_t value) {  // Stafford's variant 13 of the MurmurHash3 finaliser
-  value ^= value >> 30;
-  value *= 0xbf58476d1ce4e5b9ULL;
-  value ^= value >> 27;
-  value *= 0x94d049bb133111ebULL;
-  return value ^ (value >> 31);
-}
 
 class Selection {
  public:
@@ -167,19 +274,17 @@ class Selection {
     const size_t rank = wanted - below - 1;
     std::nth_element(border_.begin(), border_.begin() + static_cast<std::ptrdiff_t>(rank), border_.end());
     const uint64_t threshold = border_[rank];
-    size_t equal = 0;  // equal keys are next to impossible: take the first ones
-    for (size_t k = 0; k < count; ++k) equal += keys_[k] < threshold;
-    equal = wanted - equal;
+    size_t fitting = 0;
+    for (size_t k = 0; k < count; ++k) fitting += keys_[k] <= threshold;
+    size_t surplus = fitting - wanted;  // equal keys are next to impossible: leave out the last ones
+    for (size_t k = count; surplus > 0 && k-- > 0;)
+      if (keys_[k] == threshold) keys_[k] = UINT64_MAX, --surplus;
     size_t kept = 0;
-    for (size_t k = 0; k < count; ++k) {
-      bool take = keys_[k] < threshold;
-      if (keys_[k] == threshold && equal > 0) {
-        take = true;
-        --equal;
-      }
-      if (take) members[kept++] = members[k];
+    for (size_t k = 0; k < count; ++k) {  // without a branch that nobody could predict
+      members[kept] = members[k];
+      kept += keys_[k] <= threshold;
     }
-    members.resize(kept);
+    members.resize(wanted);
   }
 
  private:
@@ -227,17 +332,20 @@ void jacobi(double a[3][3], double v[3][3]) {
 
 // Rows of `frame`: x (second axis), y, z (least variance), right-handed. PCA leaves the signs of x and z free: both point
 // to the side of the centre where the mean of the neighbours lies.
-void pca_frame(const std::vector<double>& offsets, double* frame) {
-  const size_t count = offsets.size() / 3;
+void pca_frame(const Index& index, const std::vector<int64_t>& members, const double* centre, double scale,
+               double* frame) {
   double mean[3] = {}, second[6] = {};
-  for (size_t k = 0; k < count; ++k) {
-    const double x = offsets[3 * k], y = offsets[3 * k + 1], z = offsets[3 * k + 2];
+  for (const int64_t j : members) {
+    const double x = (index.x[j] - centre[0]) * scale;
+    const double y = (index.y[j] - centre[1]) * scale;
+    const double z = (index.z[j] - centre[2]) * scale;
     mean[0] += x, mean[1] += y, mean[2] += z;
     second[0] += x * x, second[1] += x * y, second[2] += x * z;
     second[3] += y * y, second[4] += y * z, second[5] += z * z;
   }
-  for (double& value : mean) value /= static_cast<double>(count);
-  for (double& value : second) value /= static_cast<double>(count);
+  const double count = static_cast<double>(members.size());
+  for (double& value : mean) value /= count;
+  for (double& value : second) value /= count;
   double a[3][3] = {{second[0] - mean[0] * mean[0], second[1] - mean[0] * mean[1], second[2] - mean[0] * mean[2]},
                     {0, second[3] - mean[1] * mean[1], second[4] - mean[1] * mean[2]},
                     {0, 0, second[5] - mean[2] * mean[2]}};
@@ -331,6 +439,9 @@ struct IndexBuffers {
   }
 };
 
+// Members of a ball that are enough for a patch of this length.
+size_t enough_for(Py_ssize_t length) { return std::max(kEnough, 4 * static_cast<size_t>(length)); }
+
 bool out_of_memory() {
   PyErr_NoMemory();
   return false;
@@ -353,7 +464,9 @@ bool for_each(Py_ssize_t count, Work&& work) {
 PyObject* count_neighbours(PyObject*, PyObject* args) {
   PyObject *index_object, *centres_object, *counts_object;
   double radius;
-  if (!PyArg_ParseTuple(args, "OOdO", &index_object, &centres_object, &radius, &counts_object)) return nullptr;
+  Py_ssize_t enough;
+  if (!PyArg_ParseTuple(args, "OOdnO", &index_object, &centres_object, &radius, &enough, &counts_object))
+    return nullptr;
   IndexBuffers held;
   Buffer centres, counts;
   if (!held.take(index_object) || !centres.take(centres_object, 8, false, "centres") ||
@@ -361,8 +474,8 @@ PyObject* count_neighbours(PyObject*, PyObject* args) {
     return nullptr;
   Neighbourhood neighbourhood(held.index, radius);
   const bool done = for_each(counts.items(), [&](Py_ssize_t i) {
-    counts.data<int64_t>()[i] =
-        static_cast<int64_t>(neighbourhood.around(centres.data<double>() + 3 * i).size());
+    counts.data<int64_t>()[i] = static_cast<int64_t>(
+        neighbourhood.count(centres.data<double>() + 3 * i, static_cast<size_t>(std::max<Py_ssize_t>(enough, 0))));
   });
   if (!done) return nullptr;
   Py_RETURN_NONE;
@@ -388,9 +501,8 @@ PyObject* sample_neighbours(PyObject*, PyObject* args) {
     return nullptr;
   Neighbourhood neighbourhood(held.index, radius);
   Selection selection;
-  std::vector<int64_t> members;
   const bool done = for_each(length ? n : 0, [&](Py_ssize_t i) {
-    members = neighbourhood.around(centres.data<double>() + 3 * i);
+    std::vector<int64_t>& members = neighbourhood.around(centres.data<double>() + 3 * i, enough_for(length));
     counts.data<int64_t>()[i] = static_cast<int64_t>(members.size());
     if (static_cast<Py_ssize_t>(members.size()) > length)
       selection.keep(members, held.index.ids, centre_ids.data<uint64_t>()[i], key, static_cast<size_t>(length));
@@ -424,32 +536,26 @@ PyObject* build_patches(PyObject*, PyObject* args) {
   const Index& index = held.index;
   Neighbourhood neighbourhood(index, radius);
   Selection selection;
-  std::vector<int64_t> members;
-  std::vector<double> offsets;
+  const double scale = 1 / radius;
   const bool done = for_each(length ? n : 0, [&](Py_ssize_t i) {
     const double* centre = centres.data<double>() + 3 * i;
+    const uint64_t id = centre_ids.data<uint64_t>()[i];
     double* frame = frames.data<double>() + 9 * i;
     float* patch = patches.data<float>() + 3 * length * i;
-    members = neighbourhood.around(centre);
+    std::vector<int64_t>& members = neighbourhood.around(centre, enough_for(length), id);
     counts.data<int64_t>()[i] = static_cast<int64_t>(members.size());
     if (members.empty()) {
       for (int k = 0; k < 9; ++k) frame[k] = k % 4 == 0;
       std::fill(patch, patch + 3 * length, 0.0f);
       return;
     }
-    offsets.resize(3 * members.size());
-    for (size_t k = 0; k < members.size(); ++k) {
-      offsets[3 * k] = (index.x[members[k]] - centre[0]) / radius;
-      offsets[3 * k + 1] = (index.y[members[k]] - centre[1]) / radius;
-      offsets[3 * k + 2] = (index.z[members[k]] - centre[2]) / radius;
-    }
-    pca_frame(offsets, frame);
+    pca_frame(index, members, centre, scale, frame);
     if (static_cast<Py_ssize_t>(members.size()) > length)
-      selection.keep(members, index.ids, centre_ids.data<uint64_t>()[i], key, static_cast<size_t>(length));
+      selection.keep(members, index.ids, id, key, static_cast<size_t>(length));
     for (size_t k = 0; k < members.size(); ++k) {
-      const double x = (index.x[members[k]] - centre[0]) / radius;
-      const double y = (index.y[members[k]] - centre[1]) / radius;
-      const double z = (index.z[members[k]] - centre[2]) / radius;
+      const double x = (index.x[members[k]] - centre[0]) * scale;
+      const double y = (index.y[members[k]] - centre[1]) * scale;
+      const double z = (index.z[members[k]] - centre[2]) * scale;
       for (int row = 0; row < 3; ++row)
         patch[3 * k + static_cast<size_t>(row)] =
             static_cast<float>(frame[3 * row] * x + frame[3 * row + 1] * y + frame[3 * row + 2] * z);
@@ -462,7 +568,7 @@ PyObject* build_patches(PyObject*, PyObject* args) {
 
 PyMethodDef methods[] = {
     {"count_neighbours", count_neighbours, METH_VARARGS,
-     "count_neighbours(index, centres (q, 3) f8, radius, counts (q,) i8 out)"},
+     "count_neighbours(index, centres (q, 3) f8, radius, enough, counts (q,) i8 out)"},
     {"sample_neighbours", sample_neighbours, METH_VARARGS,
      "sample_neighbours(index, centres (q, 3) f8, centre_ids (q,) u8, radius, key, indices (q, N) i8 out, "
      "counts (q,) i8 out)"},

@@ -4,7 +4,9 @@ from numpy.typing import NDArray
 
 Index = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 
-def count_neighbours(index: Index, centres: NDArray[Any], radius: float, counts: NDArray[Any], /) -> None: ...
+def count_neighbours(
+    index: Index, centres: NDArray[Any], radius: float, enough: int, counts: NDArray[Any], /
+) -> None: ...
 def sample_neighbours(
     index: Index,
     centres: NDArray[Any],

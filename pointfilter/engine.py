@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import threading
+from collections.abc import Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +17,25 @@ from numpy.typing import NDArray
 from pointfilter.errors import InvalidModelError, ParameterError, ProviderUnavailableError
 from pointfilter.models import ModelBundle
 
-DEVICES = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+
+@dataclass(frozen=True)
+class Device:
+    """An execution provider of onnxruntime and how it is set up here."""
+
+    provider: str
+    options: Mapping[str, str] = field(default_factory=dict)
+    one_call_at_a_time: bool = False
+    """The provider's sessions take no calls from several threads at once."""
+
+
+DEVICES = {
+    "cpu": Device("CPUExecutionProvider"),
+    "openvino": Device("OpenVINOExecutionProvider", {"device_type": "CPU", "num_of_threads": "1"}),
+    "cuda": Device("CUDAExecutionProvider"),
+    "tensorrt": Device("TensorrtExecutionProvider"),
+    "coreml": Device("CoreMLExecutionProvider"),
+    "directml": Device("DmlExecutionProvider", one_call_at_a_time=True),
+}
 AUTO_ORDER = ("cuda", "cpu")
 MAX_THREADS = 1024
 
@@ -35,7 +57,9 @@ class Engine:
         Raises ProviderUnavailableError, ParameterError, InvalidModelError.
         """
         self.bundle = bundle
-        self.device, provider = _choose(device)
+        self.device = _choose(device)
+        chosen = DEVICES[self.device]
+        self._turn = threading.Lock() if chosen.one_call_at_a_time else nullcontext()
         if not 0 <= threads <= MAX_THREADS:
             raise ParameterError(
                 f"threads must be from 0 to {MAX_THREADS}, got {threads}", limit=MAX_THREADS, actual=threads
@@ -49,13 +73,15 @@ class Engine:
         if hashlib.sha256(weights).hexdigest() != bundle.sha256:
             raise InvalidModelError(f"model.onnx of {bundle.name!r} changed after it was checked")
         try:
-            self._session = onnxruntime.InferenceSession(weights, options, providers=[provider])
+            self._session = onnxruntime.InferenceSession(
+                weights, options, providers=[chosen.provider], provider_options=[dict(chosen.options)]
+            )
         except Exception as error:  # onnxruntime's own tree differs between versions and providers
             raise InvalidModelError(f"onnxruntime cannot load model {bundle.name!r}: {_first_line(error)}") from error
         self.provider: str = self._session.get_providers()[0]
-        if self.provider != provider:
+        if self.provider != chosen.provider:
             raise ProviderUnavailableError(
-                f"{provider} was asked for and {self.provider} came up",
+                f"{chosen.provider} was asked for and {self.provider} came up",
                 hint="see the log of onnxruntime for the reason",
             )
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
@@ -64,7 +90,8 @@ class Engine:
         self._input, self._output = inputs[0].name, outputs[0].name
 
     def __call__(self, patches: NDArray[np.float32]) -> NDArray[np.float32]:
-        answer: NDArray[np.float32] = self._session.run([self._output], {self._input: patches})[0]
+        with self._turn:
+            answer: NDArray[np.float32] = self._session.run([self._output], {self._input: patches})[0]
         return answer
 
     def warm_up(self) -> None:
@@ -79,19 +106,19 @@ class Engine:
             raise InvalidModelError(f"model {self.bundle.name!r} answered a test patch with shape {answer.shape}")
 
 
-def _choose(device: str) -> tuple[str, str]:
+def _choose(device: str) -> str:
     present = onnxruntime.get_available_providers()
     if device == "auto":
-        device = next(name for name in AUTO_ORDER if DEVICES[name] in present)
+        device = next(name for name in AUTO_ORDER if DEVICES[name].provider in present)
     if device not in DEVICES:
         raise ParameterError(f"device must be one of auto, {', '.join(DEVICES)}, got {device!r}", actual=device)
-    if DEVICES[device] not in present:
+    if DEVICES[device].provider not in present:
         raise ProviderUnavailableError(
-            f"device {device!r} needs {DEVICES[device]}, which this onnxruntime does not have",
+            f"device {device!r} needs {DEVICES[device].provider}, which this onnxruntime does not have",
             actual=", ".join(present),
             hint="install the onnxruntime build for it, or use device=auto",
         )
-    return device, DEVICES[device]
+    return device
 
 
 def available_cpus() -> int:

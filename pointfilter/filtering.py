@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -235,7 +236,7 @@ def _one_pass(
         return len(chosen)
 
     with timings.measure("patches"):
-        counts = _count(index, centres, threads, check)
+        counts = _count(index, centres, patch_points, threads, check)
 
     def tasks() -> Iterator[tuple[NDArray[np.int64], int]]:
         for length, positions in length_buckets(counts, patch_points):
@@ -288,13 +289,15 @@ def _patches_per_batch(length: int) -> int:
     return max(1, ROWS_PER_BATCH // length)
 
 
-def _count(index: NeighbourIndex, centres: Float64, threads: int, check: Callable[[], None]) -> NDArray[np.int64]:
-    """Neighbours of every centre. Balls that hold most of the cloud make this slow, so it can be cancelled too."""
+def _count(
+    index: NeighbourIndex, centres: Float64, enough: int, threads: int, check: Callable[[], None]
+) -> NDArray[np.int64]:
+    """Neighbours of every centre, up to `enough`. Can be cancelled."""
     counts = [np.empty(0, dtype=np.int64)]
     with ThreadPoolExecutor(threads, thread_name_prefix="count") as pool:
         starts = range(0, len(centres), CENTRES_PER_COUNT)
         for first in range(0, len(starts), threads):
             parts = [centres[start : start + CENTRES_PER_COUNT] for start in starts[first : first + threads]]
-            counts += pool.map(index.count, parts)
+            counts += pool.map(partial(index.count, enough=enough), parts)
             check()
     return np.concatenate(counts)

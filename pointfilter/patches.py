@@ -4,16 +4,19 @@ The one copy of this code: the service, the command line and the training all cu
 compiled (`_native.cpp`, docs/adr/0002-compiled-patches.md); this module prepares the index and says what the arrays
 mean.
 
-Three properties hold and are tested:
+Four properties hold and are tested:
 
 * the patch turns, moves and scales with the cloud, because the frame's signs come from the patch itself and the random
   choice is keyed to `stable_ids`, which know nothing of orientation, origin, scale or row order;
 * nothing depends on batches, threads or the order of the input rows;
+* where a ball holds thousands of points, patch and frame are made from a share of them that is the same for all its
+  neighbours (at least 1024, at least four times the patch's length): what a point costs does not grow with the density;
 * a patch of n points may be written at any length >= n: the rest is padded with the origin, which is the centre point.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -38,7 +41,7 @@ class Patches:
 
     points: (B, N, 3) float32, centred, rotated, divided by r, padded with zeros.
     frames: (B, 3, 3) float64, the rotations R; the rows are the x, y and z axis of the patch.
-    counts: (B,) int64, neighbours in the ball (before downsampling), the centre included.
+    counts: (B,) int64, neighbours that the points were chosen from, the centre included.
     """
 
     points: Float32
@@ -51,8 +54,8 @@ class NeighbourIndex:
 
     points: (n, 3) float64, finite. radius: r > 0, same unit. ids: (n,) uint64, one a point (`stable_ids`).
 
-    The points are kept sorted by (cell, id); `order[k]` is the row in `points` of the k-th one. Centres that come in
-    this order are answered fastest.
+    The points are kept sorted by (cell, mixed id); `order[k]` is the row in `points` of the k-th one. Centres that come
+    in this order are answered fastest.
     """
 
     def __init__(self, points: Float64, radius: float, ids: UInt64) -> None:
@@ -65,7 +68,7 @@ class NeighbourIndex:
         cells = np.floor((points - low) / edge).astype(np.int64)
         shape = (cells.max(axis=0) + 1) if len(points) else np.ones(3, dtype=np.int64)
         keys = (cells[:, 2] * shape[1] + cells[:, 1]) * shape[0] + cells[:, 0]
-        self.order: Int64 = np.lexsort((ids, keys)).astype(np.int64)
+        self.order: Int64 = np.lexsort((_mixed(ids), keys)).astype(np.int64)
         cell_keys, cell_starts = np.unique(keys[self.order], return_index=True)
         self._arrays = (
             np.ascontiguousarray(points[self.order].T),
@@ -76,16 +79,16 @@ class NeighbourIndex:
             shape.astype(np.int64),
         )
 
-    def count(self, centres: Float64) -> Int64:
-        """How many points lie closer than r to each of the (q, 3) float64 centres: (q,) int64."""
+    def count(self, centres: Float64, enough: int = sys.maxsize) -> Int64:
+        """How many points lie closer than r to each of the (q, 3) float64 centres: (q,) int64, none above `enough`."""
         counts = np.empty(len(centres), dtype=np.int64)
-        _native.count_neighbours(self._arrays, np.ascontiguousarray(centres), self.radius, counts)
+        _native.count_neighbours(self._arrays, np.ascontiguousarray(centres), self.radius, enough, counts)
         return counts
 
     def sample(self, centres: Float64, centre_ids: UInt64, length: int, key: int) -> tuple[Int64, Int64]:
         """Rows of at most `length` neighbours of each centre, chosen by key where there are more.
 
-        Returns (rows (q, length) int64, filled with -1; counts (q,) int64 before the choice).
+        Returns (rows (q, length) int64, filled with -1; counts (q,) int64 of the neighbours to choose from).
         """
         positions = np.empty((len(centres), length), dtype=np.int64)
         counts = np.empty(len(centres), dtype=np.int64)
@@ -95,7 +98,7 @@ class NeighbourIndex:
         return np.where(positions >= 0, self.order[positions], -1), counts
 
     def patches(self, centres: Float64, centre_ids: UInt64, length: int, key: int) -> Patches:
-        """The patches of (q, 3) float64 centres, each `length` points long (Eq. 2; frames see the whole ball).
+        """The patches of (q, 3) float64 centres, each `length` points long (Eq. 2; frames see all neighbours).
 
         A patch with more neighbours keeps a random choice of them, the centre always among them; the choice depends on
         `key` and on the ids of centre and neighbour, and on nothing else.
@@ -107,6 +110,15 @@ class NeighbourIndex:
             self._arrays, np.ascontiguousarray(centres), centre_ids, self.radius, key, points, frames, counts
         )
         return Patches(points, frames, counts)
+
+
+def _mixed(ids: UInt64) -> UInt64:
+    """The native code's mix(id): Stafford's variant 13 of the MurmurHash3 finaliser."""
+    values = ids ^ (ids >> np.uint64(30))
+    values = values * np.uint64(0xBF58476D1CE4E5B9)
+    values ^= values >> np.uint64(27)
+    values *= np.uint64(0x94D049BB133111EB)
+    return values ^ (values >> np.uint64(31))
 
 
 def stable_ids(points: Float64) -> UInt64:

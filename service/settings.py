@@ -42,7 +42,7 @@ class Settings(BaseSettings):
     max_models: Annotated[int, Field(ge=2)] = 4
     """Most models kept loaded at once; the one used longest ago makes room, the default model never does."""
 
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: Literal["auto", "cpu", "openvino", "cuda", "tensorrt", "coreml", "directml"] = "auto"
     """Where the network runs. `auto` takes CUDA where it is there; one asked for by name and missing ends the start."""
 
     threads: Annotated[int, Field(ge=0, le=1024)] = 0

@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import json
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 
 from pointfilter import Engine, ModelBundle
 from pointfilter import engine as engine_module
-from pointfilter.engine import MAX_THREADS, available_cpus
+from pointfilter.engine import DEVICES, MAX_THREADS, Device, available_cpus
 from pointfilter.errors import InvalidModelError, ParameterError, ProviderUnavailableError
 from pointfilter.models import load_bundle
 
@@ -36,13 +37,57 @@ def test_a_provider_that_is_missing_is_an_error_and_no_silent_fallback(
         Engine(bundle, "cuda")
 
 
+def test_a_provider_gets_its_options(bundle: ModelBundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As far as it can be seen without the provider: that what DEVICES says reaches onnxruntime."""
+    seen = {}
+
+    class Session(onnxruntime.InferenceSession):
+        def __init__(
+            self, weights: bytes, options: object, providers: list[str], provider_options: list[dict[str, str]]
+        ) -> None:
+            seen.update(zip(providers, provider_options, strict=True))
+            super().__init__(weights, options, providers=["CPUExecutionProvider"])
+
+        def get_providers(self) -> list[str]:
+            return [*seen, "CPUExecutionProvider"]
+
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: [d.provider for d in DEVICES.values()])
+    monkeypatch.setattr(onnxruntime, "InferenceSession", Session)
+    engine = Engine(bundle, "openvino", threads=2)
+    assert seen == {"OpenVINOExecutionProvider": {"device_type": "CPU", "num_of_threads": "1"}}
+    assert (engine.device, engine.provider) == ("openvino", "OpenVINOExecutionProvider")
+
+
+def test_a_device_that_takes_one_call_at_a_time_gets_one(bundle: ModelBundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(engine_module.DEVICES, "shy", Device("CPUExecutionProvider", one_call_at_a_time=True))
+    engine = Engine(bundle, "shy", threads=4)
+    session = engine._session
+    running, most = 0, 0
+
+    class Watched:
+        def run(self, *arguments: object) -> object:
+            nonlocal running, most
+            running += 1
+            most = max(most, running)
+            answer = session.run(*arguments)
+            running -= 1
+            return answer
+
+    engine._session = Watched()
+    patches = np.random.default_rng(0).uniform(-1, 1, (50, 64, 3)).astype(np.float32)
+    with ThreadPoolExecutor(4) as pool:
+        answers = list(pool.map(engine, [patches] * 20))
+    assert most == 1
+    assert all((answer == answers[0]).all() for answer in answers)
+
+
 def test_a_provider_that_does_not_come_up_is_an_error(bundle: ModelBundle, monkeypatch: pytest.MonkeyPatch) -> None:
     """onnxruntime falls back by itself where a provider cannot start; that must not pass for the one asked for."""
-    monkeypatch.setitem(engine_module.DEVICES, "other", "OtherExecutionProvider")
+    monkeypatch.setitem(engine_module.DEVICES, "other", Device("OtherExecutionProvider"))
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["OtherExecutionProvider"])
     real = onnxruntime.InferenceSession
 
-    def fall_back(path: Path, options: object, providers: list[str]) -> object:
+    def fall_back(path: Path, options: object, providers: list[str], provider_options: object) -> object:
         return real(path, options, providers=["CPUExecutionProvider"])
 
     monkeypatch.setattr(onnxruntime, "InferenceSession", fall_back)
@@ -52,7 +97,7 @@ def test_a_provider_that_does_not_come_up_is_an_error(bundle: ModelBundle, monke
 
 @pytest.mark.parametrize("device", ["gpu", "", "CPU"])
 def test_an_unknown_device(device: str, bundle: ModelBundle) -> None:
-    with pytest.raises(ParameterError, match="auto, cpu, cuda"):
+    with pytest.raises(ParameterError, match="auto, cpu, openvino, cuda, tensorrt, coreml, directml"):
         Engine(bundle, device)
 
 

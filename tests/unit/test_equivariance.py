@@ -49,6 +49,21 @@ def test_rotation_translation_and_scale(
     np.testing.assert_allclose((moved - shift) @ turn, expected, atol=2e-5 * radius)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_dense_cloud_turns_too(seed: int) -> None:
+    """Balls of some 2 500 points, of which fewer are looked at: which ones must not depend on the pose."""
+    points = cloud_of((seed, 5_000, "sheet"))
+    rng = np.random.default_rng(seed)
+    turn, shift = rotation(rng), rng.normal(size=3)
+
+    def filtered(cloud: np.ndarray) -> np.ndarray:
+        return filter_points(cloud, pooled, radius=0.7, iterations=1, patch_points=64)
+
+    expected = filtered(points)
+    assert np.abs(expected - points).max() > 0.01
+    np.testing.assert_allclose((filtered(points @ turn.T + shift) - shift) @ turn, expected, atol=2e-5)
+
+
 def test_both_sides_of_the_downsampling_are_exercised() -> None:
     """The clouds above have balls with fewer and with more neighbours than the patches have places."""
     from pointfilter.patches import NeighbourIndex, stable_ids

@@ -304,7 +304,9 @@ def test_counting_can_be_cancelled_too(monkeypatch: pytest.MonkeyPatch) -> None:
     counted = []
     real = filtering.NeighbourIndex.count
     monkeypatch.setattr(
-        filtering.NeighbourIndex, "count", lambda self, centres: counted.append(len(centres)) or real(self, centres)
+        filtering.NeighbourIndex,
+        "count",
+        lambda self, centres, enough: counted.append(len(centres)) or real(self, centres),
     )
     with pytest.raises(FilteringCancelledError):
         filter_points(points, pooled, radius=0.01, cancelled=lambda: True)

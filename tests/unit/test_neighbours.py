@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from pointfilter.errors import ParameterError
-from pointfilter.patches import NeighbourIndex, sampling_key, stable_ids
+from pointfilter.patches import NeighbourIndex, _mixed, sampling_key, stable_ids
 
 
 def index_of(points: np.ndarray, radius: float) -> tuple[NeighbourIndex, np.ndarray]:
@@ -118,6 +118,69 @@ def test_an_empty_cloud_has_no_neighbours() -> None:
 def test_a_radius_that_is_none_is_refused(radius: float) -> None:
     with pytest.raises(ParameterError, match="radius"):
         index_of(np.zeros((3, 3)), radius)
+
+
+def test_counting_stops_where_it_is_told_to() -> None:
+    points = random_cloud("random", np.random.default_rng(0))
+    index, _ = index_of(points, 0.6)
+    counts = index.count(points)
+    assert counts.min() < 12 < counts.max()
+    np.testing.assert_array_equal(index.count(points, 12), np.minimum(counts, 12))
+
+
+# --- dense clouds ---
+
+ENOUGH = 1024  # what _native.cpp calls kEnough
+
+
+def looked_at(points: np.ndarray, ids: np.ndarray, centre: np.ndarray, radius: float, enough: int) -> np.ndarray:
+    """By definition: the points of the highest level that has enough of them in the ball, as sorted rows."""
+    mixed = [int(value) for value in _mixed(ids)]
+    zeros = np.array([64 - value.bit_length() for value in mixed])
+    (ball,) = np.nonzero(np.linalg.norm(points - centre, axis=1) < radius)
+    level = max((k for k in range(1, 41) if (zeros[ball] >= k).sum() >= enough), default=0)
+    return ball[zeros[ball] >= level]
+
+
+@pytest.mark.parametrize("length", [16, 300])
+def test_a_dense_ball_is_thinned_to_the_highest_level_that_is_enough(length: int) -> None:
+    rng = np.random.default_rng(0)
+    points = np.vstack([rng.uniform(-1, 1, (20_000, 3)) * [1, 1, 0.1], rng.uniform(1, 3, (3_000, 3)) * [1, 1, 0.1]])
+    index, ids = index_of(points, 0.7)
+    centres = np.concatenate([np.flatnonzero(points[:, 0] < 1)[:30], np.flatnonzero(points[:, 0] > 1)[:30]])
+    rng.shuffle(centres)
+    chosen, counts = index.sample(points[centres], ids[centres], length, 5)
+    patches = index.patches(points[centres], ids[centres], length, 5)
+    thinned = 0
+    for row, centre in enumerate(centres):
+        rows = looked_at(points, ids, points[centre], 0.7, max(ENOUGH, 4 * length))
+        assert counts[row] == len(rows)
+        assert set(chosen[row][chosen[row] >= 0]) <= set(rows)
+        with_centre = np.union1d(rows, [centre])
+        assert patches.counts[row] == len(with_centre)
+        axes = np.linalg.eigh(np.cov((points[with_centre] - points[centre]).T))[1]
+        np.testing.assert_allclose(np.abs(patches.frames[row] @ axes)[[2, 0, 1], [0, 1, 2]], 1, atol=1e-6)
+        thinned += len(rows) < (np.linalg.norm(points - points[centre], axis=1) < 0.7).sum()
+    assert 20 < thinned < 60
+
+
+def test_a_thinned_patch_holds_its_centre() -> None:
+    points = np.random.default_rng(1).uniform(-1, 1, (9_000, 3))
+    index, ids = index_of(points, 1.2)
+    patches = index.patches(points[:200], ids[:200], 32, 0)
+    assert patches.counts.max() < 3_000
+    assert (np.abs(patches.points).max(axis=2) == 0).any(axis=1).all()
+
+
+def test_how_a_ball_is_thinned_does_not_depend_on_who_is_asked_before() -> None:
+    rng = np.random.default_rng(2)
+    points = np.vstack([rng.normal(size=(6_000, 3)) * 0.2, rng.uniform(-2, 2, (2_000, 3))])
+    index, ids = index_of(points, 0.5)
+    order = rng.permutation(len(points))[:300]
+    forwards, counts = index.sample(points[order], ids[order], 20, 1)
+    backwards, _ = index.sample(points[order[::-1]], ids[order[::-1]], 20, 1)
+    assert counts.min() < ENOUGH < counts.max()
+    np.testing.assert_array_equal(forwards, backwards[::-1])
 
 
 # --- downsampling ---

@@ -152,11 +152,11 @@ def test_buffers_that_do_not_fit_are_refused() -> None:
     ids = stable_ids(points)
     arrays = NeighbourIndex(points, 1.0, ids)._arrays
     counts = np.empty(20, np.int64)
-    _native.count_neighbours(arrays, points, 1.0, counts)
+    _native.count_neighbours(arrays, points, 1.0, 9, counts)
     with pytest.raises(ValueError, match="centres"):
-        _native.count_neighbours(arrays, points[:5], 1.0, counts)
+        _native.count_neighbours(arrays, points[:5], 1.0, 9, counts)
     with pytest.raises(TypeError, match="centres"):
-        _native.count_neighbours(arrays, points.astype(np.float32), 1.0, counts)
+        _native.count_neighbours(arrays, points.astype(np.float32), 1.0, 9, counts)
     with pytest.raises(ValueError, match="frames"):
         _native.build_patches(
             arrays, points, ids, 1.0, 0, np.empty((20, 4, 3), np.float32), np.empty((19, 3, 3)), counts
@@ -164,10 +164,10 @@ def test_buffers_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="indices"):
         _native.sample_neighbours(arrays, points, ids, 1.0, 0, np.empty(21, np.int64), counts)
     with pytest.raises(ValueError, match=r"ids|points"):
-        _native.count_neighbours((arrays[0], ids[:5].copy(), *arrays[2:]), points, 1.0, counts)
+        _native.count_neighbours((arrays[0], ids[:5].copy(), *arrays[2:]), points, 1.0, 9, counts)
     counts.setflags(write=False)
     with pytest.raises(ValueError, match="read-only"):
-        _native.count_neighbours(arrays, points, 1.0, counts)
+        _native.count_neighbours(arrays, points, 1.0, 9, counts)
 
 
 def test_copies_of_the_centre_do_not_crowd_out_its_neighbours() -> None:
