@@ -14,6 +14,9 @@ from pointfilter.noise import bounding_box_diagonal
 Float64 = NDArray[np.float64]
 
 MSE_NEIGHBOURS = 10  # M in Eq. 9
+FIRST_TRIANGLES = 4  # of a size, asked for at each point; then GROWTH times as many
+GROWTH = 3
+PAIRS_AT_ONCE = 1_000_000  # of point and triangle, held in memory
 
 
 def normalised(clean: Float64, *others: Float64) -> tuple[Float64, ...]:
@@ -60,6 +63,7 @@ def closest_on_surface(points: Float64, vertices: Float64, faces: NDArray[np.int
     reach = np.linalg.norm(corners - centres[:, None, :], axis=2).max(axis=1)
     best = np.full(len(points), np.inf)
     closest = np.zeros_like(points)
+    far = np.zeros(len(points))  # distance of the farthest centre that was asked for
 
     def offer(rows: NDArray[np.int64], triangles: NDArray[np.int64]) -> None:
         """Takes over what these triangles (one a row, rows may repeat) have nearer than what is known."""
@@ -72,18 +76,22 @@ def closest_on_surface(points: Float64, vertices: Float64, faces: NDArray[np.int
         closest[rows[better]] = places[better]
 
     sizes = np.ceil(np.log2(np.maximum(reach, reach.max() * 1e-6 + 1e-300)))
-    for size in np.unique(sizes):
+    names, counts = np.unique(sizes, return_counts=True)
+    for size in names[
+        np.argsort(-counts)
+    ]:  # where most of the surface is, most points end; then little is left to look at
         group = np.flatnonzero(sizes == size)
         tree = cKDTree(centres[group])
         largest = reach[group].max()
-        nearest, row = tree.query(points, workers=-1)
-        offer(np.arange(len(points)), group[row])
-        candidates = np.flatnonzero(nearest - largest < best)
-        for chunk in np.array_split(candidates, max(1, len(candidates) // 5_000)):
-            found = tree.query_ball_point(points[chunk], best[chunk] + largest, workers=-1)
-            counts = np.fromiter(map(len, found), np.int64, len(found))
-            if counts.sum():
-                offer(np.repeat(chunk, counts), group[np.concatenate([np.asarray(f, np.int64) for f in found])])
+        rows, asked = np.arange(len(points)), 0
+        while len(rows) and asked < len(group):  # more and more of the nearest centres, where they can still matter
+            wanted = min(max(FIRST_TRIANGLES, GROWTH * asked), len(group))
+            for part in np.array_split(rows, -(-len(rows) * wanted // PAIRS_AT_ONCE)):
+                distances, found = tree.query(points[part], k=np.arange(asked + 1, wanted + 1), workers=-1)
+                row, column = np.nonzero(distances - reach[group[found]] < best[part, None])
+                offer(part[row], group[found[row, column]])
+                far[part] = distances[:, -1]
+            rows, asked = rows[far[rows] - largest < best[rows]], wanted
     return closest
 
 
