@@ -44,6 +44,7 @@ PASSES = ((0.0035, 0), (0.1, 2), (0.2, 3))
 """What "auto" does: (mean displacement of one pass, in units of the radius; passes over a cloud that stays below it).
 
 docs/adr/0007-automatic-iterations.md has the measurements."""
+ARRIVED = 0.02  # of the radius: after the second pass, a point whose step was shorter stays where it is
 MOST_PASSES = 4  # above all of them
 CENTRES_PER_COUNT = 1024  # centres whose neighbours are counted between two looks at `cancelled`
 
@@ -121,10 +122,11 @@ def filter_points(
 
     radius: absolute, in the unit of the points; by default 5 % of the bounding-box diagonal. It is taken once, from the
     input, and kept for all iterations. iterations: a number, or "auto" for as many as the cloud needs (PASSES); a clean
-    one comes back as it was. patch_points: N, what the network was trained with. seed: of the downsampling.
-    threads: how many batches are evaluated at once; the result does not depend on it. progress(done, total) is called
-    from this thread, in units of points times iterations, from 0 on. cancelled() is asked between batches, from any
-    thread. after_pass(passes, points) sees the cloud as it is after every pass.
+    one comes back as it was. A point that has ARRIVED stays where it is in later ones. patch_points: N, what the
+    network was trained with. seed: of the downsampling. threads: how many batches are evaluated at once; the result
+    does not depend on it. progress(done, total) is called from this thread, in units of points times iterations, from 0
+    on. cancelled() is asked between batches, from any thread. after_pass(passes, points) sees the cloud as it is after
+    every pass.
 
     Raises TooFewPointsError, DegenerateCloudError, ParameterError, FilteringCancelledError.
     """
@@ -164,20 +166,23 @@ def filter_points(
             return points.copy()
     else:
         passes = iterations
-    if progress is not None:
-        progress(0, passes * len(points))
+    moving = np.ones(len(points), dtype=bool)
     for iteration in range(passes):
-        if iteration:
+        if iteration and moving.any():
             with timings.measure("index"):
                 index = NeighbourIndex(moved, absolute_radius, ids)
 
-        def report(done: int, iteration: int = iteration) -> None:
-            if progress is not None:
-                progress(iteration * len(points) + done, passes * len(points))
+        arrived = len(points) - int(moving.sum())
 
-        moved = _one_pass(
-            moved, ids, index, predict, patch_points, sampling_key(seed, iteration), threads, report, cancelled, timings
-        )
+        def report(done: int, done_before: int = iteration * len(points) + arrived) -> None:
+            if progress is not None:
+                progress(done_before + done, passes * len(points))
+
+        report(0)
+        before, key = moved, sampling_key(seed, iteration)
+        moved = _one_pass(before, moving, ids, index, predict, patch_points, key, threads, report, cancelled, timings)
+        if iteration:  # the second step is the first one that sees cleaned neighbours
+            moving &= np.linalg.norm(moved - before, axis=1) >= ARRIVED * absolute_radius
         timings.passes += 1
         if after_pass is not None:
             after_pass(timings.passes, moved + offset)
@@ -206,6 +211,7 @@ def expected_displacement(
 
 def _one_pass(
     points: Float64,
+    moving: NDArray[np.bool_],
     ids: NDArray[np.uint64],
     index: NeighbourIndex,
     predict: Predict,
@@ -216,8 +222,8 @@ def _one_pass(
     cancelled: Callable[[], bool] | None,
     timings: Timings,
 ) -> Float64:
-    """Eq. 8 once for every point. Batches depend on the cloud alone, each point's answer on its own patch alone."""
-    rows = index.order  # in this order neighbours in space are neighbours in memory
+    """Eq. 8 once for every point that is `moving` (n,). Each point's answer depends on its own patch alone."""
+    rows = index.order[moving[index.order]]  # in this order neighbours in space are neighbours in memory
     centres, centre_ids = points[rows], ids[rows]
     result = points.copy()
 

@@ -114,11 +114,12 @@ class NeighbourIndex:
 
 def _mixed(ids: UInt64) -> UInt64:
     """The native code's mix(id): Stafford's variant 13 of the MurmurHash3 finaliser."""
-    values = ids ^ (ids >> np.uint64(30))
-    values = values * np.uint64(0xBF58476D1CE4E5B9)
+    values: UInt64 = ids ^ (ids >> np.uint64(30))
+    values *= np.uint64(0xBF58476D1CE4E5B9)
     values ^= values >> np.uint64(27)
     values *= np.uint64(0x94D049BB133111EB)
-    return values ^ (values >> np.uint64(31))
+    values ^= values >> np.uint64(31)
+    return values
 
 
 def stable_ids(points: Float64) -> UInt64:

@@ -134,7 +134,7 @@ def test_another_encoding(encoding: str, noisy_file: Path, tmp_path: Path) -> No
         ("--iterations", 101, "from 1 to 100, got 101"),
         ("--seed", -1, "seed must be from 0"),
         ("--threads", -1, "threads must be from 0"),
-        ("--device", "tpu", "auto, cpu, cuda"),
+        ("--device", "tpu", "auto, cpu, openvino"),
     ],
 )
 def test_parameters_out_of_range(

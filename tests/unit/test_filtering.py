@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import threading
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -140,6 +141,35 @@ def test_automatic_iterations_follow_the_displacement(noisy_crease: np.ndarray) 
     assert done == [*(passes for _, passes in PASSES), MOST_PASSES]
     assert done == sorted(done)
     assert done[0] == 0
+
+
+def test_points_that_have_arrived_stay_and_cost_nothing(noisy_crease: np.ndarray) -> None:
+    """Steps shrink to a tenth from pass to pass; some points arrive in the second, the others in the third."""
+    radius, count = 0.15, len(noisy_crease)
+    evaluated: list[int] = []
+    seen: list[np.ndarray] = [noisy_crease]
+    passes = 0
+
+    def predict(patches: np.ndarray) -> np.ndarray:
+        evaluated.append(passes)
+        step = filtering.ARRIVED * (12.0 if len(evaluated) % 2 else 8.0) * 0.1**passes
+        return np.tile(np.array([0, 0, step], np.float32), (len(patches), 1))
+
+    def after(done: int, points: np.ndarray) -> None:
+        nonlocal passes
+        passes = done
+        seen.append(points)
+
+    filter_points(noisy_crease, predict, radius=radius, iterations=4, after_pass=after)
+    steps = [np.linalg.norm(b - a, axis=1) / radius for a, b in pairwise(seen)]
+    assert (steps[0] > 0).all()
+    assert (steps[1] > 0).all()
+    arrived = steps[1] < filtering.ARRIVED
+    assert 0 < arrived.sum() < count
+    assert (steps[2][arrived] == 0).all()
+    assert (steps[2][~arrived] > 0).all()
+    assert (steps[3] == 0).all()
+    assert set(evaluated) == {0, 1, 2}
 
 
 def test_every_pass_is_seen(noisy_crease: np.ndarray) -> None:
