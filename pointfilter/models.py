@@ -21,7 +21,7 @@ from pointfilter.errors import InvalidModelError, ModelNotFoundError
 SCHEMA = 1
 FRAME = "pca-mean-sign"  # the frame's sign rule that the weights were trained with (patches.py)
 BUNDLES = Path(__file__).parent / "bundles"
-DEFAULT_MODEL = "pointfilter-fast"
+DEFAULT_MODEL = "pointfilter-fast-int8"
 
 Auto = Literal["auto"]
 AUTO: Final[Auto] = "auto"

@@ -43,7 +43,8 @@ class Settings(BaseSettings):
     """Most models kept loaded at once; the one used longest ago makes room, the default model never does."""
 
     device: Literal["auto", "cpu", "openvino", "cuda", "tensorrt", "coreml", "directml"] = "auto"
-    """Where the network runs. `auto` takes CUDA where it is there; one asked for by name and missing ends the start."""
+    """Where the network runs. `auto` takes CUDA where it is there, else the CPU; `cpu`, `openvino`, `cuda`, `tensorrt`,
+    `coreml` or `directml` by name; one that is missing ends the start."""
 
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
     """Threads a filter request uses. 0 shares the CPUs that the process may use among the workers."""

@@ -6,7 +6,6 @@ Patches come from pointfilter.patches, as they do in the service.
 
 from __future__ import annotations
 
-import dataclasses
 import queue
 import re
 import threading
@@ -196,11 +195,16 @@ def training_clouds(
 
 
 def validation_cloud(number: int, settings: DataSettings) -> TrainingCloud:
-    """A cloud of a shape that no run trains on."""
-    settings = dataclasses.replace(
-        settings, fewest_points=VALIDATION_POINTS, most_points=VALIDATION_POINTS, open_share=0.0, uneven_share=0.0
+    """A cloud of a shape that no run trains on, the same for all runs with the settings' radius and clean points."""
+    same = DataSettings(
+        fewest_points=VALIDATION_POINTS,
+        most_points=VALIDATION_POINTS,
+        clean_points=settings.clean_points,
+        radius=settings.radius,
+        open_share=0.0,
+        uneven_share=0.0,
     )
-    return cloud_from_mesh(random_shape(number, VALIDATION_FAMILY), settings, VALIDATION_SEED + number)
+    return cloud_from_mesh(random_shape(number, VALIDATION_FAMILY), same, VALIDATION_SEED + number)
 
 
 def cut_batch(clouds: list[TrainingCloud], settings: DataSettings, step: int) -> Batch:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from pydantic import ValidationError
 
+from pointfilter.engine import DEVICES
 from service.settings import PREFIX, Settings, variable
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "configuration.md"
@@ -27,6 +29,10 @@ def test_the_document_lists_every_knob_as_it_is() -> None:
         default = "unset" if field.default is None else f"`{field.default}`"
         expected.append((variable(name), default, " ".join(field.description.split())))
     assert rows == expected
+
+
+def test_every_device_of_the_library_may_be_asked_for() -> None:
+    assert get_args(Settings.model_fields["device"].annotation) == ("auto", *DEVICES)
 
 
 def test_the_environment_is_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

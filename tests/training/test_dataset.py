@@ -18,6 +18,7 @@ from training.dataset import (
     cut_batch,
     load_author_clouds,
     training_clouds,
+    validation_cloud,
 )
 from training.shapes import Mesh, load_meshes, random_shape
 from training.train import TrainingSettings
@@ -225,3 +226,10 @@ def test_a_folder_that_is_not_the_authors_layout(layout: Path) -> None:
     (layout / "cube.npy").unlink()
     with pytest.raises(FileNotFoundError, match="cube"):
         load_author_clouds(layout, 0.05)
+
+
+def test_validation_clouds_are_the_same_for_every_run(tiny: TrainingSettings) -> None:
+    other = dataclasses.replace(tiny.data, seed=9, noise_skew=3.0, noise_high=0.1, most_points=5_000, thin_share=1.0)
+    first, second = (validation_cloud(3, data) for data in (tiny.data, other))
+    np.testing.assert_array_equal(first.points, second.points)
+    assert (first.points != validation_cloud(4, other).points).any()
