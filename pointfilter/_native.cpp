@@ -78,6 +78,7 @@ class Neighbourhood {
   // for `enough`.
   std::vector<int64_t>& around(const double* centre, size_t enough) {
     locate(centre);
+    if (fresh_) guess(enough);
     gather(centre, SIZE_MAX);
     while (level_ > 0 && members_.size() < enough) {
       set_level(level_ - 1);
@@ -146,6 +147,16 @@ class Neighbourhood {
       members_.resize(before + found);
       if (members_.size() >= enough) return;
     }
+  }
+
+  // A level that is not too high to begin with: a ball fills more than an eighth of its cells, mostly.
+  void guess(size_t enough) {
+    fresh_ = false;
+    int64_t total = 0;
+    for (const Cell& cell : cells_) total += cell.end - cell.start;
+    int level = 0;
+    while (level < kHighestLevel && static_cast<size_t>(total >> level) > 8 * enough) ++level;
+    set_level(level);
   }
 
   // Goes up to the highest level that still has `enough` of the members.
@@ -236,6 +247,7 @@ class Neighbourhood {
   const Index& index_;
   double radius_;
   int level_ = 0;
+  bool fresh_ = true;
   bool valid_ = false;
   std::array<int64_t, 6> box_{};
   std::array<int64_t, 3> home_cell_{};

@@ -181,6 +181,8 @@ def test_how_a_ball_is_thinned_does_not_depend_on_who_is_asked_before() -> None:
     backwards, _ = index.sample(points[order[::-1]], ids[order[::-1]], 20, 1)
     assert counts.min() < ENOUGH < counts.max()
     np.testing.assert_array_equal(forwards, backwards[::-1])
+    alone = np.vstack([index.sample(points[[row]], ids[[row]], 20, 1)[0] for row in order])
+    np.testing.assert_array_equal(forwards, alone)
 
 
 # --- downsampling ---
