@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from pointfilter.errors import InvalidModelError, ParameterError, ProviderUnavailableError
 from pointfilter.models import ModelBundle
 
+THREADS = "{threads}"  # stands for their number in a provider's options
+
 
 @dataclass(frozen=True)
 class Device:
@@ -24,13 +26,16 @@ class Device:
 
     provider: str
     options: Mapping[str, str] = field(default_factory=dict)
+    """With THREADS for the number of callers."""
     one_call_at_a_time: bool = False
     """The provider's sessions take no calls from several threads at once."""
 
 
 DEVICES = {
     "cpu": Device("CPUExecutionProvider"),
-    "openvino": Device("OpenVINOExecutionProvider", {"device_type": "CPU", "num_of_threads": "1"}),
+    "openvino": Device(
+        "OpenVINOExecutionProvider", {"device_type": "CPU", "num_of_threads": THREADS, "num_streams": THREADS}
+    ),
     "cuda": Device("CUDAExecutionProvider"),
     "tensorrt": Device("TensorrtExecutionProvider"),
     "coreml": Device("CoreMLExecutionProvider"),
@@ -69,12 +74,15 @@ class Engine:
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
         options.log_severity_level = 3
+        provider_options = {
+            name: str(self.threads) if value == THREADS else value for name, value in chosen.options.items()
+        }
         weights = bundle.onnx.read_bytes()  # what is run is what the bundle's sha256 stands for
         if hashlib.sha256(weights).hexdigest() != bundle.sha256:
             raise InvalidModelError(f"model.onnx of {bundle.name!r} changed after it was checked")
         try:
             self._session = onnxruntime.InferenceSession(
-                weights, options, providers=[chosen.provider], provider_options=[dict(chosen.options)]
+                weights, options, providers=[chosen.provider], provider_options=[provider_options]
             )
         except Exception as error:  # onnxruntime's own tree differs between versions and providers
             raise InvalidModelError(f"onnxruntime cannot load model {bundle.name!r}: {_first_line(error)}") from error

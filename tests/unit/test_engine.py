@@ -54,7 +54,7 @@ def test_a_provider_gets_its_options(bundle: ModelBundle, monkeypatch: pytest.Mo
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: [d.provider for d in DEVICES.values()])
     monkeypatch.setattr(onnxruntime, "InferenceSession", Session)
     engine = Engine(bundle, "openvino", threads=2)
-    assert seen == {"OpenVINOExecutionProvider": {"device_type": "CPU", "num_of_threads": "1"}}
+    assert seen == {"OpenVINOExecutionProvider": {"device_type": "CPU", "num_of_threads": "2", "num_streams": "2"}}
     assert (engine.device, engine.provider) == ("openvino", "OpenVINOExecutionProvider")
 
 
