@@ -280,21 +280,24 @@ def trained_network(state: dict[str, Any]) -> Pointfilter:
 def training_record(state: dict[str, Any]) -> dict[str, Any]:
     """How the weights of a checkpoint came about, the runs that they started from included, the first one first.
 
-    Of a bundle that filtered clouds for it only the name is told: where it lay is nobody's business.
+    Of bundles that filtered clouds for them only the names are told: where they lay is nobody's business.
     """
-    data = state["settings"]["data"]
-    settings = {**state["settings"], "data": {**data, "filtered_by": Path(data.get("filtered_by", "")).name}}
     return {
-        "settings": settings,
+        "settings": _without_folders(state["settings"]),
         "steps": state["step"],
-        "patches": state["step"] * settings["data"]["batch"],
+        "patches": state["step"] * state["settings"]["data"]["batch"],
         "hours": round(state["seconds"] / 3600, 3),
         "curve": [
             {key: row[key] for key in ("step", "loss", "validation_loss", "cd_1", "cd_2") if key in row}
             for row in state["history"]
         ],
-        "before": state.get("before", []),
+        "before": [{**record, "settings": _without_folders(record["settings"])} for record in state.get("before", [])],
     }
+
+
+def _without_folders(settings: dict[str, Any]) -> dict[str, Any]:
+    data = settings["data"]
+    return {**settings, "data": {**data, "filtered_by": Path(data.get("filtered_by", "")).name}}
 
 
 def _use_bfloat16(precision: str) -> bool:

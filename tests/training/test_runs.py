@@ -189,6 +189,9 @@ def test_a_record_names_no_folder(straight: Run) -> None:
     state["settings"]["data"]["filtered_by"] = str(Path("my", "private", "bundle"))
     assert training_record(state)["settings"]["data"]["filtered_by"] == "bundle"
     assert state["settings"]["data"]["filtered_by"] == str(Path("my", "private", "bundle"))
+    state["before"] = [{"settings": {"data": {"filtered_by": str(Path("my", "older", "one"))}}}]
+    (ancestor,) = training_record(state)["before"]
+    assert ancestor["settings"]["data"]["filtered_by"] == "one"
 
 
 def test_a_narrower_network_grows(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
