@@ -43,12 +43,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from benchmarks import classics
-from benchmarks.subjects import Subject
+from benchmarks.subjects import Column, Subject, sample_mesh
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine, available_cpus
-from pointfilter.filtering import ROWS_PER_BATCH
+from pointfilter.filtering import patches_per_batch
 from pointfilter.models import available_models, open_model
-from pointfilter.noise import add_noise, bounding_box_diagonal
+from pointfilter.noise import bounding_box_diagonal
 from pointfilter.patches import NeighbourIndex, stable_ids
 from pointfilter.pipeline import filter_cloud
 
@@ -57,6 +57,7 @@ Float64 = NDArray[np.float64]
 Figures = dict[str, Any]
 
 NOISE = 0.005
+COLUMN = Column("speed", NOISE)
 ITERATIONS = 2
 PAPER = {"encoder": [64, 128, 256, 512, 1024], "decoder": [512, 256]}
 PAPER_POINTS = 500
@@ -134,9 +135,9 @@ def network(model: str, device: str, threads: int) -> Figures:
     """Patches a second of the network alone, in batches as the filter makes them, one thread a batch."""
     bundle = open_model(model)
     engine = Engine(bundle, device, threads)
-    _, noisy = ring(20_000).clouds_of_noise(NOISE)
+    _, noisy = ring(20_000).clouds(COLUMN)
     index, ids = _indexed(noisy, bundle.radius)
-    size = max(1, ROWS_PER_BATCH // bundle.patch_points)
+    size = patches_per_batch(bundle.patch_points)
     batches = [
         index.patches(noisy[start : start + size], ids[start : start + size], bundle.patch_points, 0).points
         for start in range(0, 64 * size, size)
@@ -161,7 +162,7 @@ def end_to_end(model: str, device: str, threads: int, points: int) -> Figures:
     engine = Engine(bundle, device, threads)
     engine.warm_up()
     subject = ring(points)
-    clean, noisy = subject.clouds_of_noise(NOISE)
+    clean, noisy = subject.clouds(COLUMN)
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder, "in.ply"), Path(folder, "out.ply")
         PointCloud(noisy).write(source)
@@ -202,7 +203,7 @@ def naive(model: str, threads: int) -> Figures:
     length = bundle.patch_points if bundle else PAPER_POINTS
     torch.set_num_threads(threads)
     net = Pointfilter(settings).eval()
-    _, points = ring(CLASSIC_POINTS).clouds_of_noise(NOISE)
+    _, points = ring(CLASSIC_POINTS).clouds(COLUMN)
     radius = 0.05 * bounding_box_diagonal(points)
     rng = np.random.default_rng(0)
     rows = rng.choice(len(points), NAIVE_SAMPLE, replace=False)
@@ -230,7 +231,7 @@ def naive(model: str, threads: int) -> Figures:
 def classic(method: str) -> Figures:
     """Seconds and accuracy of a classic filter on 100 k points."""
     subject = ring(CLASSIC_POINTS)
-    clean, noisy = subject.clouds_of_noise(NOISE)
+    clean, noisy = subject.clouds(COLUMN)
     started = time.perf_counter()
     filtered = classics.smooth(method, noisy, NOISE)
     seconds = time.perf_counter() - started
@@ -241,19 +242,10 @@ def classic(method: str) -> Figures:
 # How it is measured ------------------------------------------------------------------------------------------------
 
 
-class Ring(Subject):
-    """A ring with a square profile: flat and curved faces that meet in right angles."""
-
-    def clouds_of_noise(self, level: float) -> tuple[Float64, Float64]:
-        """The clean cloud and a noisy copy, row for row."""
-        return self.clean, add_noise(self.clean, level, np.random.default_rng(1))
-
-
-def ring(points: int) -> Ring:
-    """A ring with so many points spread evenly over it."""
+def ring(points: int) -> Subject:
+    """A ring with a square profile and so many points: flat and curved faces that meet in right angles."""
     mesh = trimesh.creation.annulus(r_min=0.3, r_max=0.5, height=0.3, sections=512)
-    clean, _ = trimesh.sample.sample_surface(mesh, points, seed=0)
-    return Ring("ring", np.asarray(clean, np.float64), np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64))
+    return sample_mesh("ring", np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64), points)
 
 
 def _indexed(points: Float64, fraction: float) -> tuple[NeighbourIndex, NDArray[np.uint64]]:

@@ -144,10 +144,11 @@ def load_clouds(folder: Path) -> list[Subject]:
 
 def load_meshes(folder: Path, points: int = 200_000) -> list[Subject]:
     """Every .ply mesh of a folder, with clean points spread evenly over it."""
-    subjects = []
-    for path in sorted(folder.glob("*.ply")):
-        vertices, faces = read_mesh(path)
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        clean, _ = trimesh.sample.sample_surface(mesh, points, seed=zlib.crc32(path.stem.encode()))
-        subjects.append(Subject(path.stem, np.asarray(clean, dtype=np.float64), vertices, faces))
-    return subjects
+    return [sample_mesh(path.stem, *read_mesh(path), points) for path in sorted(folder.glob("*.ply"))]
+
+
+def sample_mesh(name: str, vertices: Float64, faces: NDArray[np.int64], points: int) -> Subject:
+    """A mesh with so many clean points spread evenly over it, the same in every run."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    clean, _ = trimesh.sample.sample_surface(mesh, points, seed=zlib.crc32(name.encode()))
+    return Subject(name, np.asarray(clean, dtype=np.float64), vertices, faces)

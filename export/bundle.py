@@ -66,8 +66,7 @@ def write_bundle(
         raise ParityError(f"torch and onnxruntime differ by {error:.3g} of the radius, more than {PARITY_TOLERANCE:g}")
     rounding = 0.0
     if int8:
-        exact = serialised
-        serialised, rounding = _rounded(loaded, exact)
+        serialised, rounding = _rounded(loaded, serialised)
         if not rounding <= ROUNDING_TOLERANCE:
             raise RoundingError(
                 f"int8 changes displacements by {rounding:.3g} of their length, more than {ROUNDING_TOLERANCE:g}"

@@ -246,7 +246,7 @@ def _one_pass(
 
     def tasks() -> Iterator[tuple[NDArray[np.int64], int]]:
         for length, positions in length_buckets(counts, patch_points):
-            size = BATCHES_PER_TASK * _patches_per_batch(length)
+            size = BATCHES_PER_TASK * patches_per_batch(length)
             for start in range(0, len(positions), size):
                 yield positions[start : start + size], length
 
@@ -278,7 +278,7 @@ def _displacements(predict: Predict, patches: Patches, check: Callable[[], None]
     check() is called between the network's batches.
     """
     count, length, _ = patches.points.shape
-    size = _patches_per_batch(length)
+    size = patches_per_batch(length)
     parts = []
     for start in range(0, count, size):
         check()
@@ -290,7 +290,7 @@ def _displacements(predict: Predict, patches: Patches, check: Callable[[], None]
     return displacements
 
 
-def _patches_per_batch(length: int) -> int:
+def patches_per_batch(length: int) -> int:
     """Patches of `length` points that go through the network together."""
     return max(1, ROWS_PER_BATCH // length)
 
