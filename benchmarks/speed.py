@@ -11,9 +11,12 @@ Needs no data: the cloud is a ring with sharp edges and 0.5 % noise.
 network     real patches of that cloud through the network alone; GFLOP/s count multiplications and additions of its
             layers; share: of the best sgemm (NumPy's) in the same process, with the same number of threads
 end_to_end  a binary PLY read, filtered twice, written; stages in seconds of the clock (the work of several threads
-            divided by their number); peak: of the process's memory
+            divided by their number); peak: of the process's memory. More than 100 k points: with the default model
+            only, unless others are named
+served      the same file through `python -m service`, from the first byte sent to the last one received, alone and
+            two at once
 naive       research code's way: one patch at a time in Python, then torch in batches of 64; timed on a sample and
-            scaled; with the bundle's own network, and with the paper's network and its 500 points
+            scaled; with each network of the bundles, and with the paper's network and its 500 points
 classic     of the quality benchmark, tuned for this noise; not beaten: as accurate as the bundle in CD and P2F, and
             faster
 """
@@ -28,11 +31,15 @@ import multiprocessing
 import os
 import platform
 import resource
+import socket
+import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +54,7 @@ from benchmarks.subjects import Column, Subject, sample_mesh
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine, available_cpus
 from pointfilter.filtering import patches_per_batch
-from pointfilter.models import available_models, open_model
+from pointfilter.models import DEFAULT_MODEL, available_models, open_model
 from pointfilter.noise import bounding_box_diagonal
 from pointfilter.patches import NeighbourIndex, stable_ids
 from pointfilter.pipeline import filter_cloud
@@ -88,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.speed", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--models", nargs="*", default=list(available_models()), help="names or folders of bundles")
+    parser.add_argument("--models", nargs="*", help="names or folders of bundles; default: all that come with this")
     parser.add_argument("--devices", nargs="+", default=["cpu"], help="see pointfilter filter --help")
     parser.add_argument("--points", type=int, nargs="*", default=[10_000, 100_000, 1_000_000])
     parser.add_argument("--threads", type=int, nargs="+", default=sorted({1, available_cpus()}))
@@ -101,12 +108,17 @@ def _parser() -> argparse.ArgumentParser:
 def _plan(options: argparse.Namespace) -> Iterator[tuple[Callable[..., Figures], Figures]]:
     """What is measured, in order."""
     most = max(options.threads)
-    for model, device, threads in itertools.product(options.models, options.devices, options.threads):
+    models = list(available_models()) if options.models is None else options.models
+    for model, device, threads in itertools.product(models, options.devices, options.threads):
         yield network, {"model": model, "device": device, "threads": threads}
-    for model, device, points in itertools.product(options.models, options.devices, options.points):
-        yield end_to_end, {"model": model, "device": device, "threads": most, "points": points}
+    for model, device, points in itertools.product(models, options.devices, options.points):
+        if points <= CLASSIC_POINTS or options.models is not None or model == DEFAULT_MODEL:
+            yield end_to_end, {"model": model, "device": device, "threads": most, "points": points}
+    if CLASSIC_POINTS in options.points and importlib.util.find_spec("uvicorn"):
+        for model, device in itertools.product(models[:1] if options.models else [DEFAULT_MODEL], options.devices):
+            yield served, {"model": model, "device": device, "threads": most}
     if importlib.util.find_spec("torch"):
-        for model in options.models:
+        for model in {_widths(open_model(model).network): model for model in models}.values():
             yield naive, {"model": model, "threads": most}
         yield naive, {"model": "", "threads": most}
     else:
@@ -180,6 +192,7 @@ def end_to_end(model: str, device: str, threads: int, points: int) -> Figures:
     infer = stages["infer"] / threads
     return {
         "provider": engine.provider,
+        "widths": _widths(bundle.network),
         "seconds": seconds,
         "read": read,
         "index": stages["index"],
@@ -190,6 +203,53 @@ def end_to_end(model: str, device: str, threads: int, points: int) -> Figures:
         "peak_mb": memory / 1e6,
         **({name: subject.scores(clean, filtered.xyz)[name] for name in ("cd", "p2f")} if points <= 200_000 else {}),
     }
+
+
+def served(model: str, device: str, threads: int) -> Figures:
+    """Seconds for a file of 100 k points through the service, and for two of them sent at once."""
+    _, noisy = ring(CLASSIC_POINTS).clouds(COLUMN)
+    values = {"port": _free_port(), "model": model, "device": device, "threads": threads, "log_level": "warning"}
+    environment = os.environ | {f"POINTFILTER_{name.upper()}": str(value) for name, value in values.items()}
+    address = f"http://127.0.0.1:{values['port']}"
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder, "in.ply")
+        PointCloud(noisy).write(source)
+        body = source.read_bytes()
+
+        def post(_: int = 0) -> int:
+            request = urllib.request.Request(f"{address}/filter?iterations={ITERATIONS}", data=body, method="POST")  # noqa: S310
+            with urllib.request.urlopen(request) as answer:  # noqa: S310
+                return len(answer.read())
+
+        process = subprocess.Popen([sys.executable, "-m", "service"], env=environment)
+        try:
+            _wait_until_ready(address, process)
+            started = time.perf_counter()
+            post()
+            alone = time.perf_counter() - started
+            started = time.perf_counter()
+            with ThreadPoolExecutor(2) as pool:
+                list(pool.map(post, range(2)))
+            two = time.perf_counter() - started
+        finally:
+            process.terminate()
+            process.wait()
+    return {"points": CLASSIC_POINTS, "seconds": alone, "two_seconds": two}
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port: int = server.getsockname()[1]
+    return port
+
+
+def _wait_until_ready(address: str, process: subprocess.Popen[bytes]) -> None:
+    while process.poll() is None:
+        with suppress(OSError), urllib.request.urlopen(f"{address}/health/ready") as answer:  # noqa: S310
+            if answer.status == 200:
+                return
+        time.sleep(0.1)
+    raise RuntimeError(f"the service ended with exit code {process.returncode}")
 
 
 def naive(model: str, threads: int) -> Figures:
@@ -225,7 +285,13 @@ def naive(model: str, threads: int) -> Figures:
             answer = net(torch.from_numpy(np.stack(patches))).numpy()
         points[rows[start : start + NAIVE_BATCH]] += radius * np.einsum("bi,bij->bj", answer, np.stack(frames))
     seconds = (time.perf_counter() - started) / NAIVE_SAMPLE * CLASSIC_POINTS * ITERATIONS
-    return {"points": CLASSIC_POINTS, "patch_points": length, "sample": NAIVE_SAMPLE, "seconds": seconds}
+    return {
+        "points": CLASSIC_POINTS,
+        "patch_points": length,
+        "widths": _widths(bundle.network if bundle else PAPER),
+        "sample": NAIVE_SAMPLE,
+        "seconds": seconds,
+    }
 
 
 def classic(method: str) -> Figures:
@@ -251,6 +317,10 @@ def ring(points: int) -> Subject:
 def _indexed(points: Float64, fraction: float) -> tuple[NeighbourIndex, NDArray[np.uint64]]:
     ids = stable_ids(points)
     return NeighbourIndex(points, fraction * bounding_box_diagonal(points), ids), ids
+
+
+def _widths(network: Figures) -> str:
+    return "-".join(map(str, [*network["encoder"], *network["decoder"]]))
 
 
 def patch_flops(widths: Figures, points: int) -> float:
@@ -345,6 +415,10 @@ def _line(row: Figures) -> str:
             f"{row['points']:8d} points × {ITERATIONS}: {row['seconds']:7.2f} s ({stages}); not the network "
             f"{row['not_network']:.0%}; peak {row['peak_mb']:.0f} MB"
         )
+    elif row["what"] == "served":
+        figures = (
+            f"{row['points']:8d} points × {ITERATIONS}: {row['seconds']:7.2f} s; two at once {row['two_seconds']:.2f} s"
+        )
     else:
         scaled = f", scaled from {row['sample']} points" if "sample" in row else ""
         figures = f"{row['points']:8d} points: {row['seconds']:8.1f} s{scaled}"
@@ -355,19 +429,45 @@ def _ratios(table: list[Figures]) -> Iterator[str]:
     """What the rows say about each other."""
     runs = [row for row in table if row["what"] == "end_to_end"]
     for run in (run for run in runs if run["points"] == CLASSIC_POINTS):
-        name = f"{run['model']} ({run['device']})"
-        for other in (row for row in table if row["what"] == "naive" and row["model"] in (run["model"], "")):
-            ratio = other["seconds"] / run["seconds"]
-            yield f"{name}: {ratio:.1f} times as fast as the naive way with {other['model'] or 'the paper’s network'}"
-        for big in runs:
-            if (big["model"], big["device"]) == (run["model"], run["device"]) and big["points"] > run["points"]:
-                slower = big["seconds"] / big["points"] / (run["seconds"] / run["points"])
-                yield f"{name}: a point of {big['points']} takes {slower:.2f} times as long as one of {run['points']}"
-        for other in (row for row in table if row["what"] == "classic"):
+        same = [row for row in table if (row.get("model"), row.get("device")) == (run["model"], run["device"])]
+        for said in itertools.chain(
+            _against_the_bound(run, same), _against_others(run, table), _against_larger(run, same), _served(run, same)
+        ):
+            yield f"{run['model']} ({run['device']}): {said}"
+
+
+def _against_the_bound(run: Figures, same: list[Figures]) -> Iterator[str]:
+    for row in same:
+        if row["what"] == "network" and row["threads"] == run["threads"]:
+            gflops = row["gflops"] / row["patches_per_second"] * run["points"] * ITERATIONS
+            ratio = run["seconds"] / (gflops / row["sgemm_gflops"])
+            yield f"{ratio:.2f} times the seconds that its products would take at sgemm's rate"
+
+
+def _against_others(run: Figures, table: list[Figures]) -> Iterator[str]:
+    for other in table:
+        ratio = other.get("seconds", 0.0) / run["seconds"]
+        if other["what"] == "naive" and (not other["model"] or other["widths"] == run["widths"]):
+            network = "the same network" if other["model"] else "the paper's network"
+            yield f"{ratio:.1f} times as fast as the naive way with {network}, {other['patch_points']} points a patch"
+        if other["what"] == "classic":
             accurate = other["cd"] <= run["cd"] and other["p2f"] <= run["p2f"]
-            ratio = other["seconds"] / run["seconds"]
             verdict = "less accurate" if not accurate else "beaten" if ratio > 1 else "NOT BEATEN"
-            yield f"{name}: {other['method']} takes {ratio:.2f} times as long: {verdict}"
+            yield f"{other['method']} takes {ratio:.2f} times as long: {verdict}"
+
+
+def _against_larger(run: Figures, same: list[Figures]) -> Iterator[str]:
+    for big in same:
+        if big["what"] == "end_to_end" and big["points"] > run["points"]:
+            slower = big["seconds"] / big["points"] / (run["seconds"] / run["points"])
+            yield f"a point of {big['points']} takes {slower:.2f} times as long as one of {run['points']}"
+
+
+def _served(run: Figures, same: list[Figures]) -> Iterator[str]:
+    for row in same:
+        if row["what"] == "served":
+            yield f"the service takes {row['seconds'] / run['seconds'] - 1:+.1%} of the library's time on top"
+            yield f"two requests at once take {row['two_seconds'] / row['seconds']:.2f} times as long as one"
 
 
 def _compared(now: Figures, before: Figures) -> Iterator[str]:

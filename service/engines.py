@@ -58,6 +58,11 @@ class Engines:
             self._loaded.move_to_end(name)
             return self._loaded[name]
 
+    def provider(self, name: str) -> str | None:
+        """What evaluates a model; None while it is not loaded."""
+        engine = self._loaded.get(name)
+        return engine.provider if engine else None
+
     def _bundle(self, name: str) -> ModelBundle:
         if name not in self._bundles:
             models = available_models(self._folders)

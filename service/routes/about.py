@@ -37,10 +37,13 @@ class Model(BaseModel):
     patch_points: int
     radius: float
     iterations: int | Auto
+    precision: str
     parameters: int
     network: dict[str, Any]
     training: dict[str, Any]
     scores: dict[str, Any]
+    provider: str | None
+    """What evaluates it, while it is loaded."""
 
 
 class Version(BaseModel):
@@ -71,7 +74,11 @@ def model(name: str, house: HouseDep) -> Model:
 
 
 def _described(bundle: ModelBundle, house: House) -> Model:
-    return Model(default=bundle.name == house.settings.model, **bundle.summary())
+    return Model(
+        default=bundle.name == house.settings.model,
+        provider=house.engines.provider(bundle.name),
+        **bundle.summary(),
+    )
 
 
 @router.get("/version", summary="Versions", responses=answers("internal-error"))
