@@ -208,7 +208,7 @@ def end_to_end(model: str, device: str, threads: int, points: int) -> Figures:
 def served(model: str, device: str, threads: int) -> Figures:
     """Seconds for a file of 100 k points through the service, and for two of them sent at once."""
     _, noisy = ring(CLASSIC_POINTS).clouds(COLUMN)
-    values = {"port": _free_port(), "model": model, "device": device, "threads": threads, "log_level": "warning"}
+    values = {"port": free_port(), "model": model, "device": device, "threads": threads, "log_level": "warning"}
     environment = os.environ | {f"POINTFILTER_{name.upper()}": str(value) for name, value in values.items()}
     address = f"http://127.0.0.1:{values['port']}"
     with tempfile.TemporaryDirectory() as folder:
@@ -237,7 +237,8 @@ def served(model: str, device: str, threads: int) -> Figures:
     return {"points": CLASSIC_POINTS, "seconds": alone, "two_seconds": two}
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port of this machine that nobody listens on."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port: int = server.getsockname()[1]
     return port

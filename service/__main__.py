@@ -1,72 +1,11 @@
-"""`python -m service`: one process, settings from the environment (docs/configuration.md).
-
-Exit codes: 0 after SIGTERM or Ctrl-C once the running requests are done; 1 when the default model cannot be used;
-2 for settings that make no sense; 3 when the address cannot be listened on.
-"""
-
-from __future__ import annotations
+"""`python -m service`. As little as there can be: every worker's process runs through this file, too."""
 
 import os
 import sys
-from types import FrameType
 
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read when onnxruntime is imported, so it comes first
 
-import prometheus_client
-import uvicorn
-from pydantic import ValidationError
-
-from service.app import create_app
-from service.house import House
-from service.logs import configure_logging
-from service.settings import Settings, variable
-
-
-class _Server(uvicorn.Server):
-    """Says that it drains before it does."""
-
-    def __init__(self, config: uvicorn.Config, house: House) -> None:
-        super().__init__(config)
-        self._house = house
-        house.on_failure = self._fail
-
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        self._house.draining = True
-        super().handle_exit(sig, frame)
-        self._captured_signals.clear()  # a stop that was asked for ends with exit code 0
-
-    def _fail(self) -> None:
-        self.should_exit = True
-
-
-def main() -> int:
-    try:
-        settings = Settings()
-    except ValidationError as error:
-        for problem in error.errors():
-            name = str(problem["loc"][0]) if problem["loc"] else ""
-            print(f"{variable(name)}: {problem['msg']}", file=sys.stderr)
-        return 2
-    configure_logging(settings)
-    prometheus_client.disable_created_metrics()  # type: ignore[no-untyped-call]
-    app = create_app(settings)
-    house: House = app.state.house
-    server = _Server(
-        uvicorn.Config(
-            app,
-            host=settings.host,
-            port=settings.port,
-            log_config=None,
-            access_log=False,  # service.requests logs each request, without what the client wrote
-            server_header=False,
-            timeout_graceful_shutdown=settings.drain_seconds,
-            ws="none",
-        ),
-        house,
-    )
-    server.run()
-    return 0 if server.started and house.failure is None else 1
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    from service.main import main
+
+    sys.exit(main(sys.argv[1:]))

@@ -1,12 +1,18 @@
-"""Backpressure: a place in the house or a refusal at the door, then a worker. Both are released in `finally`."""
+"""Backpressure: a place in the house or a refusal at the door, then a worker. Both are released in `finally`.
+
+Small clouds have a worker of their own beside the ones that they share with all others, so that none of them waits for
+a large one to be done.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import math
 import time
+from collections import Counter, deque
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
+from enum import Enum
 
 from service.errors import QueueFullError
 from service.settings import variable
@@ -16,23 +22,36 @@ LONGEST_RETRY_SECONDS = 600
 NEW_SHARE = 0.2  # of the newest measurement in the running mean
 
 
-class Admission:
-    """Counts who is in the house. To be used from one event loop only."""
+class _Lane(Enum):
+    """What a worker is for."""
 
-    def __init__(self, workers: int, queue_size: int) -> None:
+    ANY = "any"
+    SMALL = "small"
+
+
+class Admission:
+    """Counts who is in the house. To be used from one event loop only.
+
+    express: workers for small clouds alone. places_per_key: of one API key; 0 for all there are.
+    """
+
+    def __init__(self, workers: int, queue_size: int, express: int = 0, places_per_key: int = 0) -> None:
         self.workers = workers
         self.places = workers + queue_size
         self.held = 0
+        self._held_by: Counter[str] = Counter()
+        self._places_per_key = places_per_key
         self.waiting = 0
         self.running = 0
-        self._semaphore = asyncio.Semaphore(workers)
+        self._free = {_Lane.ANY: workers, _Lane.SMALL: express}
+        self._queue: deque[tuple[bool, asyncio.Future[_Lane]]] = deque()
         self._mean_seconds: float | None = None
 
     @contextmanager
-    def place(self) -> Iterator[None]:
+    def place(self, key: str | None = None) -> Iterator[None]:
         """Holds a place from before the upload until after the download, so that files on disk are bounded too.
 
-        Raises QueueFullError at once when there is none.
+        key: the name of the caller's API key. Raises QueueFullError at once when there is no place.
         """
         if self.held >= self.places:
             raise QueueFullError(
@@ -42,21 +61,29 @@ class Admission:
                 hint=f"try again later; whoever runs the service can raise {variable('queue_size')}",
                 retry_after=self.retry_after(),
             )
+        if key is not None and self._places_per_key and self._held_by[key] >= self._places_per_key:
+            raise QueueFullError(
+                f"{self._held_by[key]} requests of this API key are in progress or waiting, as many as it may have",
+                limit=self._places_per_key,
+                actual=self._held_by[key] + 1,
+                hint=f"try again later; whoever runs the service can raise {variable('places_per_key')}",
+                retry_after=self.retry_after(),
+            )
         self.held += 1
+        if key is not None:
+            self._held_by[key] += 1
         try:
             yield
         finally:
             self.held -= 1
+            if key is not None:
+                self._held_by[key] -= 1
 
     @asynccontextmanager
-    async def worker(self) -> AsyncIterator[float]:
+    async def worker(self, small: bool = False) -> AsyncIterator[float]:
         """Waits for a worker, first come first served; yields the seconds waited."""
         asked = time.perf_counter()
-        self.waiting += 1
-        try:
-            await self._semaphore.acquire()
-        finally:
-            self.waiting -= 1
+        lane = await self._wait(small)
         begun = time.perf_counter()
         self.running += 1
         try:
@@ -70,7 +97,36 @@ class Admission:
             self._measure(time.perf_counter() - begun)
         finally:
             self.running -= 1
-            self._semaphore.release()
+            self._release(lane)
+
+    async def _wait(self, small: bool) -> _Lane:
+        given: asyncio.Future[_Lane] = asyncio.get_running_loop().create_future()
+        self._queue.append((small, given))
+        self.waiting += 1
+        self._assign()
+        try:
+            return await given
+        except asyncio.CancelledError:
+            if given.done() and not given.cancelled():  # given in the very moment
+                self._release(given.result())
+            else:
+                self._queue.remove((small, given))
+            raise
+        finally:
+            self.waiting -= 1
+
+    def _assign(self) -> None:
+        for waiting in list(self._queue):
+            small, given = waiting
+            lanes = (_Lane.ANY, _Lane.SMALL) if small else (_Lane.ANY,)
+            if lane := next((lane for lane in lanes if self._free[lane]), None):
+                self._free[lane] -= 1
+                self._queue.remove(waiting)
+                given.set_result(lane)
+
+    def _release(self, lane: _Lane) -> None:
+        self._free[lane] += 1
+        self._assign()
 
     def retry_after(self) -> int:
         """Seconds until, at the measured rate, the next place falls free."""

@@ -36,10 +36,27 @@ Ready = Depends(_ready)
 """For `dependencies=`: refuses with 503 until the default model has answered, and again while draining."""
 
 
-async def _folder(house: HouseDep) -> AsyncIterator[Path]:
-    """Both end after the answer was sent, however it ended."""
+async def _caller(request: Request, house: HouseDep, exchange: ExchangeDep) -> str | None:
+    exchange.key = house.keys.caller(request.headers.get("authorization"))
+    return exchange.key
+
+
+CallerDep = Annotated[str | None, Depends(_caller)]
+"""The name of the caller's API key, None where nobody needs one, or a refusal with 401."""
+
+
+async def _place(house: HouseDep, caller: CallerDep) -> AsyncIterator[None]:
+    with house.admission.place(caller):
+        yield
+
+
+AdmittedPlace = Annotated[None, Depends(_place)]
+"""A place in the house until the answer was sent, or a refusal with 429."""
+
+
+async def _folder(house: HouseDep, _place: AdmittedPlace) -> AsyncIterator[Path]:
+    """Ends after the answer was sent, however it ended."""
     with (
-        house.admission.place(),
         tempfile.TemporaryDirectory(
             prefix="pointfilter-", dir=house.settings.temp_dir, ignore_cleanup_errors=True
         ) as name,

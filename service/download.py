@@ -11,6 +11,7 @@ from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
 from service.exchange import exchange_of
+from service.records import Outcome
 
 CHUNK_BYTES = 1 << 18
 MAX_STEM = 100
@@ -33,6 +34,18 @@ def _stem(file_name: str) -> str:
     if name.lower().endswith(".ply"):
         name = name[:-4]
     return name.strip(" .")[:MAX_STEM].rstrip(" .") or NO_NAME
+
+
+def result_headers(outcome: Outcome, seconds: dict[str, float]) -> dict[str, str]:
+    """Of a filtered file. seconds: by stage, before those of the outcome."""
+    stages = {**seconds, **outcome.seconds}
+    return {
+        "Server-Timing": ", ".join(f"{stage};dur={1000 * each:.1f}" for stage, each in stages.items()),
+        "X-Model": outcome.model,
+        "X-Points": str(outcome.points),
+        "X-Iterations": str(outcome.iterations),
+        "ETag": f'"{outcome.sha256}"',
+    }
 
 
 class FileDownload(Response):

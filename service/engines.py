@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pointfilter.engine import Engine, available_cpus
@@ -14,18 +13,14 @@ from service.settings import Settings
 
 
 class Engines:
-    """Bundles and engines by name. Its methods read files and may take a while: call them off the event loop.
+    """Bundles and engines by name. Its methods read files and may take a while: call them off the event loop."""
 
-    on_change is called with the loaded engines whenever one comes or goes.
-    """
-
-    def __init__(self, settings: Settings, on_change: Callable[[Sequence[Engine]], None] | None = None) -> None:
+    def __init__(self, settings: Settings) -> None:
         self.default = settings.model
         self._folders: list[Path] = [settings.model_dir] if settings.model_dir else []
         self._device = settings.device
         self._threads = settings.threads or max(1, available_cpus() // settings.workers)
         self._capacity = settings.max_models
-        self._on_change = on_change
         self._bundles: dict[str, ModelBundle] = {}
         self._loaded: OrderedDict[str, Engine] = OrderedDict()
         self._lock = threading.Lock()
@@ -53,15 +48,13 @@ class Engines:
                 if len(self._loaded) > self._capacity:
                     # Requests that still use the engine hold it; it goes when the last of them is done.
                     del self._loaded[next(other for other in self._loaded if other not in (self.default, name))]
-                if self._on_change:
-                    self._on_change(list(self._loaded.values()))
             self._loaded.move_to_end(name)
             return self._loaded[name]
 
-    def provider(self, name: str) -> str | None:
-        """What evaluates a model; None while it is not loaded."""
-        engine = self._loaded.get(name)
-        return engine.provider if engine else None
+    def loaded(self) -> list[Engine]:
+        """The engines in memory."""
+        with self._lock:
+            return list(self._loaded.values())
 
     def _bundle(self, name: str) -> ModelBundle:
         if name not in self._bundles:

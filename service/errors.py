@@ -6,10 +6,16 @@ PointfilterError
     ├── UnsupportedCodingError    unsupported-coding     Content-Encoding of the request
     ├── SlowTransferError         slow-transfer          the body did not arrive in time
     ├── QueueFullError            queue-full             more requests than places
+    ├── JobsFullError             jobs-full              more jobs wait than are kept
     ├── NotReadyError             not-ready              the default model has not answered yet
     ├── DrainingError             draining               the process is about to end
     ├── StorageFullError          storage-full           no room for temporary files
     ├── DeadlineError             deadline-exceeded      the work took too long and was stopped
+    ├── WorkerDiedError           worker-died            the process that did the work died, more than once
+    ├── UnauthorizedError         unauthorized           no API key, or one that is not known
+    ├── JobNotFoundError          job-not-found          unknown, expired, or somebody else's
+    ├── JobNotFinishedError       job-not-finished       there is no result yet
+    ├── JobCancelledError         job-cancelled          there will be no result
     └── ClientGoneError           client-closed          nobody waits for the answer any more
 """
 
@@ -50,6 +56,10 @@ class QueueFullError(ServiceError):
     code = "queue-full"
 
 
+class JobsFullError(ServiceError):
+    code = "jobs-full"
+
+
 class NotReadyError(ServiceError):
     code = "not-ready"
 
@@ -64,6 +74,26 @@ class StorageFullError(ServiceError):
 
 class DeadlineError(ServiceError):
     code = "deadline-exceeded"
+
+
+class WorkerDiedError(ServiceError):
+    code = "worker-died"
+
+
+class UnauthorizedError(ServiceError):
+    code = "unauthorized"
+
+
+class JobNotFoundError(ServiceError):
+    code = "job-not-found"
+
+
+class JobNotFinishedError(ServiceError):
+    code = "job-not-finished"
+
+
+class JobCancelledError(ServiceError):
+    code = "job-cancelled"
 
 
 class ClientGoneError(ServiceError):

@@ -28,6 +28,8 @@ class Exchange:
     code: str | None = None
     """Of service.problems.TYPES, when the request failed."""
     points: int | None = None
+    key: str | None = None
+    """Name of the caller's API key."""
     status: int | None = None
 
 

@@ -13,7 +13,8 @@ from starlette.responses import Response
 
 from pointfilter.errors import ParameterError, PointfilterError
 from service.errors import StorageFullError
-from service.problems import TYPES, problem_response
+from service.problem_types import TYPES
+from service.problems import problem_response
 
 log = logging.getLogger("service.problems")
 
@@ -28,12 +29,24 @@ def install_handlers(app: FastAPI) -> None:
     app.add_exception_handler(OSError, _os)
 
 
+def explained(error: Exception) -> tuple[str, PointfilterError | None]:
+    """The code of an error, and what may be said about it; logs what may not."""
+    if isinstance(error, PointfilterError):
+        code = error.code if error.code in TYPES else "error"
+        if TYPES[code].private:
+            log.error("%s: %s", type(error).__name__, error, exc_info=error)
+        return code, error
+    if isinstance(error, OSError) and error.errno in _FULL:
+        log.error("no room for files: %s", error.strerror)
+        full = StorageFullError("there is no room left for the upload or the result", retry_after=30)
+        return full.code, full
+    log.error("unexpected error", exc_info=error)
+    return "internal-error", None
+
+
 async def _pointfilter(request: Request, error: Exception) -> Response:
-    assert isinstance(error, PointfilterError)  # noqa: S101 - what it is installed for
-    code = error.code if error.code in TYPES else "error"
-    if TYPES[code].private:
-        log.error("%s: %s", type(error).__name__, error, exc_info=error)
-    return problem_response(request, code, error)
+    code, told = explained(error)
+    return problem_response(request, code, told)
 
 
 async def _validation(request: Request, error: Exception) -> Response:
@@ -55,9 +68,8 @@ async def _http(request: Request, error: Exception) -> Response:
 async def _os(request: Request, error: Exception) -> Response:
     if not (isinstance(error, OSError) and error.errno in _FULL):
         raise error
-    log.error("no room for temporary files: %s", error.strerror)
-    full = StorageFullError("there is no room left for the upload or the result", retry_after=30)
-    return problem_response(request, full.code, full)
+    code, told = explained(error)
+    return problem_response(request, code, told)
 
 
 def _short(value: object) -> str | float | None:

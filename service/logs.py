@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from service.exchange import current_request_id
 from service.settings import Settings
 
-EXTRAS = ("method", "route", "status", "code", "seconds", "model", "points", "provider")
+EXTRAS = ("method", "route", "status", "code", "seconds", "model", "points", "provider", "job", "attempt", "key")
 
 
 class JsonFormatter(logging.Formatter):

@@ -18,6 +18,7 @@ log = logging.getLogger("service.requests")
 
 LINGER_SECONDS = 10.0
 FILTER_ROUTE = "/filter"
+ACCEPTED = 202
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
@@ -105,7 +106,7 @@ class ExchangeMiddleware:
     def _note(self, exchange: Exchange, scope: Scope, method: str) -> None:
         seconds = time.perf_counter() - exchange.started
         route = getattr(scope.get("route"), "path", None)  # the pattern; the path itself is the client's text
-        if route == FILTER_ROUTE and method == "POST":
+        if route == FILTER_ROUTE and method == "POST" and exchange.status != ACCEPTED:  # jobs are counted when they end
             self._house.telemetry.filter_ended(exchange, seconds)
         quiet = route is not None and (route.startswith("/health") or route == "/metrics") and exchange.code is None
         log.log(
@@ -119,5 +120,6 @@ class ExchangeMiddleware:
                 "seconds": round(seconds, 4),
                 "model": exchange.model,
                 "points": exchange.points,
+                "key": exchange.key,
             },
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -55,6 +56,39 @@ class Settings(BaseSettings):
     queue_size: Annotated[int, Field(ge=0, le=10_000)] = 8
     """Filter requests that may be in the house beyond those worked on: arriving, waiting or leaving. More get a 429."""
 
+    small_bytes: Annotated[int, Field(ge=0)] = 256 * 1024
+    """Files up to this size have one more worker of their own, so that they need not wait for large ones; 0: they
+    have none."""
+
+    sync_bytes: Annotated[int, Field(ge=0)] = 128 * 1024 * 1024
+    """Larger files sent to /filter become jobs: the answer is 202 and the address of the job."""
+
+    data_dir: Path | None = None
+    """Folder for jobs, their files and their queue; by default one in the user's state folder (XDG_STATE_HOME, else
+    ~/.local/state). Processes that share it share the jobs."""
+
+    redis_url: str | None = None
+    """A Redis that holds the queue of jobs in place of a file in the data folder, such as redis://redis:6379/0."""
+
+    job_queue_size: Annotated[int, Field(ge=0, le=1_000_000)] = 100
+    """Most jobs that may wait; more get a 429."""
+
+    job_seconds: Annotated[float, Field(gt=0)] = 14_400.0
+    """Longest time that the work on a job may take, waiting not included; then it stops and the job has failed."""
+
+    job_ttl_seconds: Annotated[float, Field(gt=0)] = 86_400.0
+    """How long a job that ended, and its result, are kept."""
+
+    keys_file: Path | None = None
+    """File with the API keys that may filter, a line each, made by `python -m service key NAME`; it is read again
+    when it changes. By default nobody needs one."""
+
+    places_per_key: Annotated[int, Field(ge=0)] = 0
+    """Most filter requests that one API key may have in the house; more get a 429. 0: as many as there are."""
+
+    jobs_per_key: Annotated[int, Field(ge=0)] = 0
+    """Most unfinished jobs that one API key may have; more get a 429. 0: as many as may wait."""
+
     max_upload_bytes: Annotated[int, Field(ge=1)] = 512 * 1024 * 1024
     """Largest file taken, in bytes; larger ones get a 413."""
 
@@ -71,7 +105,8 @@ class Settings(BaseSettings):
     """Longest time a client may take to send its file (408), and again to fetch the result (the connection is cut)."""
 
     drain_seconds: Annotated[int, Field(ge=0)] = 30
-    """After SIGTERM, how long running requests may take to finish before they are stopped."""
+    """After SIGTERM, how long running requests and jobs may take to finish; then requests are stopped, and jobs go back
+    to the queue."""
 
     temp_dir: Path | None = None
     """Folder for uploads and results while a request lasts; by default the system's. Leave room for workers +
@@ -82,6 +117,14 @@ class Settings(BaseSettings):
 
     log_format: Literal["json", "text"] = "json"
     """One JSON object a line, or text for people."""
+
+    @property
+    def job_folder(self) -> Path:
+        """Where jobs lie."""
+        if self.data_dir is not None:
+            return self.data_dir
+        state = os.environ.get("XDG_STATE_HOME")
+        return (Path(state) if state else Path.home() / ".local" / "state") / "pointfilter"
 
     @property
     def read_limits(self) -> ReadLimits:

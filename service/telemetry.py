@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from prometheus_client import (
     CollectorRegistry,
@@ -16,11 +16,11 @@ from prometheus_client import (
 )
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
-from pointfilter.engine import Engine
 from service.admission import Admission
 from service.exchange import Exchange
-from service.problems import TYPES
+from service.problem_types import TYPES
 from service.work import Delivery
+from service.worker import Loaded
 
 MEDIA_TYPE = CONTENT_TYPE_LATEST
 STAGES = ("parse", "index", "patches", "infer", "write")
@@ -58,6 +58,22 @@ class Telemetry:
         self._queue_wait = Histogram(
             "pointfilter_queue_wait_seconds", "Time waited for a worker", buckets=(0.001, *SECONDS), registry=registry
         )
+        self._jobs = Counter("pointfilter_jobs", "Jobs by how they ended", ["model", "outcome"], registry=registry)
+        self._job_seconds = Histogram(
+            "pointfilter_job_duration_seconds",
+            "Work on jobs that ended well, waiting not included",
+            ["model"],
+            buckets=(*SECONDS, 1800, 3600, 7200, 14400),
+            registry=registry,
+        )
+        self._jobs_waiting = Gauge("pointfilter_jobs_waiting", "Jobs in the queue, of all processes", registry=registry)
+        self._jobs_running = Gauge("pointfilter_jobs_running", "Jobs being worked on", registry=registry)
+        self._worker_deaths = Counter(
+            "pointfilter_worker_deaths", "Workers that died or had to be killed, and were replaced", registry=registry
+        )
+        self._worker_memory = Gauge(
+            "pointfilter_worker_memory_bytes", "Resident memory of all workers", registry=registry
+        )
         self._points = Counter("pointfilter_points", "Points filtered", ["model"], registry=registry)
         self._points_per_request = Histogram(
             "pointfilter_points_per_request", "Points of a cloud", buckets=POINTS, registry=registry
@@ -91,11 +107,25 @@ class Telemetry:
         if outcome == "ok":
             self._request_seconds.labels(model).observe(seconds)
 
-    def models_loaded(self, engines: Sequence[Engine]) -> None:
+    def job_ended(self, model: str, outcome: str, seconds: float) -> None:
+        self._jobs.labels(model, outcome).inc()
+        if outcome == "ok":
+            self._job_seconds.labels(model).observe(seconds)
+
+    def watch(
+        self, jobs_waiting: Callable[[], float], jobs_running: Callable[[], float], worker_memory: Callable[[], float]
+    ) -> None:
+        self._jobs_waiting.set_function(jobs_waiting)
+        self._jobs_running.set_function(jobs_running)
+        self._worker_memory.set_function(worker_memory)
+
+    def worker_died(self) -> None:
+        self._worker_deaths.inc()
+
+    def models_loaded(self, models: Sequence[Loaded]) -> None:
         self._model_info.clear()
-        for engine in engines:
-            bundle = engine.bundle
-            self._model_info.labels(bundle.name, bundle.version, bundle.sha256, engine.provider).set(1)
+        for model in models:
+            self._model_info.labels(model.name, model.version, model.sha256, model.provider).set(1)
 
     def exposition(self) -> bytes:
         return generate_latest(self.registry)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -15,6 +16,20 @@ from service.errors import ClientGoneError, MalformedRequestError, SlowTransferE
 from service.multipart import MAX_OVERHEAD_BYTES, FilePart
 from service.settings import Settings, variable
 
+_FILE = {"type": "string", "format": "binary"}
+FILE_BODY = {
+    "requestBody": {
+        "required": True,
+        "description": "The file, as the only part of a form or as the body itself",
+        "content": {
+            "multipart/form-data": {
+                "schema": {"type": "object", "properties": {"file": _FILE}, "required": ["file"]},
+            },
+            "application/octet-stream": {"schema": _FILE},
+        },
+    }
+}
+"""For the OpenAPI document: what receive_upload takes."""
 WRITE_BYTES = 1 << 20  # collected before a thread is asked to write
 
 
@@ -59,6 +74,11 @@ async def receive_upload(request: Request, path: Path, settings: Settings) -> Up
     if not size:
         raise MalformedRequestError("the file is empty" if part else "the body is empty")
     return Upload(path, size, part.file_name if part else None)
+
+
+def adopt(upload: Upload, path: Path) -> None:
+    """Moves an upload to another place, which may be on another disk."""
+    shutil.move(upload.path, path)
 
 
 async def _copy(request: Request, file: BinaryIO, part: FilePart | None, settings: Settings, overhead: int) -> int:

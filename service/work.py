@@ -6,9 +6,9 @@ import asyncio
 import contextvars
 import hashlib
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import Executor
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
@@ -49,24 +49,38 @@ class Delivery:
 
 
 def carry_out(
-    order: Order, source: Path, target: Path, find_engine: Callable[[str], Engine], limits: ReadLimits, stop: Event
+    order: Order,
+    source: Path,
+    target: Path,
+    find_engine: Callable[[str], Engine],
+    limits: ReadLimits,
+    stopped: Callable[[], bool],
+    progress: Callable[[int, int, int], None] = lambda _done, _total, _points: None,
 ) -> Delivery:
-    """Reads `source`, filters, writes `target`. Gives up soon after `stop` is set, by FilteringCancelledError.
+    """Reads `source`, filters, writes `target`. Gives up soon after stopped() is true, by FilteringCancelledError.
 
-    Raises what the core raises: see pointfilter.errors.
+    progress(done, total, points): in units of points times iterations, and how many points are filtered. Raises what
+    the core raises: see pointfilter.errors.
     """
-    _go_on(stop)
+    _go_on(stopped)
     engine = find_engine(order.model)
     seconds: dict[str, float] = {}
     started = time.perf_counter()
     cloud = PointCloud.read(source, limits)
     seconds["parse"] = time.perf_counter() - started
-    _go_on(stop)
+    _go_on(stopped)
+    points = int(cloud.finite.sum())
     filtered, report = filter_cloud(
-        cloud, engine, iterations=order.iterations, radius=order.radius, seed=order.seed, cancelled=stop.is_set
+        cloud,
+        engine,
+        iterations=order.iterations,
+        radius=order.radius,
+        seed=order.seed,
+        progress=lambda done, total: progress(done, total, points),
+        cancelled=stopped,
     )
     seconds.update({stage: report.seconds[stage] for stage in ("index", "patches", "infer")})
-    _go_on(stop)
+    _go_on(stopped)
     started = time.perf_counter()
     filtered.write(target, order.encoding, report.comment)
     with target.open("rb") as file:
@@ -75,8 +89,8 @@ def carry_out(
     return Delivery(report, sha256, target.stat().st_size, seconds)
 
 
-def _go_on(stop: Event) -> None:
-    if stop.is_set():
+def _go_on(stopped: Callable[[], bool]) -> None:
+    if stopped():
         raise FilteringCancelledError("the work was stopped")
 
 
@@ -101,29 +115,38 @@ async def in_worker(executor: Executor, work: Callable[[Event], T]) -> T:
 
 
 @asynccontextmanager
-async def cancelled_on_disconnect(request: Request) -> AsyncIterator[None]:
+async def cancelled_when(happens: Awaitable[object], error: Exception) -> AsyncIterator[None]:
+    """Cancels what is inside when something happens, and raises `error` in place of the cancellation."""
+    task = asyncio.current_task()
+    assert task is not None  # noqa: S101 - a coroutine always runs in one
+    happened = False
+
+    async def wait() -> None:
+        nonlocal happened
+        await happens
+        happened = True
+        task.cancel()
+
+    waiting = asyncio.create_task(wait())
+    try:
+        yield
+    except asyncio.CancelledError:
+        if happened and task.uncancel() == 0:
+            raise error from None
+        raise
+    finally:
+        waiting.cancel()
+        await asyncio.wait([waiting])
+
+
+def cancelled_on_disconnect(request: Request) -> AbstractAsyncContextManager[None]:
     """Cancels what is inside when the client goes away, and raises ClientGoneError in its place.
 
     For use once the whole body was read: it listens to what the connection has to say.
     """
-    task = asyncio.current_task()
-    assert task is not None  # noqa: S101 - a coroutine always runs in one
-    gone = False
 
     async def listen() -> None:
-        nonlocal gone
         while (await request.receive())["type"] != "http.disconnect":
             pass
-        gone = True
-        task.cancel()
 
-    listener = asyncio.create_task(listen())
-    try:
-        yield
-    except asyncio.CancelledError:
-        if gone and task.uncancel() == 0:
-            raise ClientGoneError("the client went away; the work was stopped") from None
-        raise
-    finally:
-        listener.cancel()
-        await asyncio.wait([listener])
+    return cancelled_when(listen(), ClientGoneError("the client went away; the work was stopped"))

@@ -76,7 +76,7 @@ def model(name: str, house: HouseDep) -> Model:
 def _described(bundle: ModelBundle, house: House) -> Model:
     return Model(
         default=bundle.name == house.settings.model,
-        provider=house.engines.provider(bundle.name),
+        provider=next((model.provider for model in house.crew.loaded() if model.sha256 == bundle.sha256), None),
         **bundle.summary(),
     )
 

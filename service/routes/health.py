@@ -45,8 +45,10 @@ async def health(house: HouseDep) -> Health:
     )
 
 
-@router.get("/live", summary="The process answers", responses=answers("internal-error"))
-async def live() -> Alive:
+@router.get("/live", summary="The process can do its work", responses=answers("internal-error", "not-ready"))
+async def live(house: HouseDep) -> Alive:
+    """503 when the workers are gone and cannot be replaced: start the process again."""
+    house.check_alive()
     return Alive()
 
 

@@ -13,7 +13,8 @@ from fastapi.openapi.docs import get_swagger_ui_html
 from starlette.exceptions import HTTPException
 from starlette.responses import HTMLResponse
 
-from service.problems import TYPES, answers
+from service.problem_types import TYPES
+from service.problems import answers
 
 router = APIRouter(tags=["pages"])
 

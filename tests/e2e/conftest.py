@@ -79,7 +79,8 @@ def free_port() -> int:
 def running_service(folder: Path, **settings: str) -> Iterator[tuple[Server, subprocess.Popen[bytes]]]:
     """`python -m service` as a user starts it; its log goes to a file that a failing test shows."""
     port = free_port()
-    environment = os.environ | {"POINTFILTER_PORT": str(port), "ORT_DISABLE_TELEMETRY": "1"} | settings
+    ours = {"POINTFILTER_PORT": str(port), "POINTFILTER_DATA_DIR": str(folder / "data"), "ORT_DISABLE_TELEMETRY": "1"}
+    environment = os.environ | ours | settings
     with (folder / "service.log").open("wb") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "service"], cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT

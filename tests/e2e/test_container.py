@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import time
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from tests.e2e.conftest import NOISY, ROOT, Server, free_port
 pytestmark = pytest.mark.timeout(900)
 
 IMAGE = "pointfilter:latest"
+NOTICES = "/usr/share/doc/pointfilter"
 PROJECT = f"pointfilter-test-{os.getpid()}"
 
 
@@ -121,8 +123,86 @@ def test_prometheus_scrapes_it(stack: tuple[Server, Server, str]) -> None:
     pytest.fail("Prometheus never saw pointfilter_model_info")
 
 
-def test_it_comes_back_after_a_kill(stack: tuple[Server, Server, str]) -> None:
+def test_the_alert_rules_are_loaded(stack: tuple[Server, Server, str]) -> None:
+    _, prometheus, _ = stack
+    groups = prometheus.get("/api/v1/rules").json()["data"]["groups"]  # type: ignore[index]
+    loaded = {rule["name"]: rule["health"] for group in groups for rule in group["rules"]}
+    assert "PointfilterDown" in loaded
+    assert "err" not in loaded.values()
+
+
+def test_it_comes_back_after_a_stop(stack: tuple[Server, Server, str]) -> None:
     server, _, container = stack
     run("docker", "exec", container, "python3", "-c", "import os, signal; os.kill(1, signal.SIGTERM)")
     time.sleep(1)
     server.wait_until_ready(90)
+
+
+def test_a_kill_loses_no_job(stack: tuple[Server, Server, str]) -> None:
+    server, _, container = stack
+    body = NOISY.read_bytes()
+    jobs = [str(server.post("/jobs?iterations=1", body).json()["href"]) for _ in range(3)]
+    (described,) = json.loads(run("docker", "inspect", container))
+    try:
+        os.kill(described["State"]["Pid"], signal.SIGKILL)  # the engine must not think that somebody wanted it stopped
+    except (PermissionError, ProcessLookupError):
+        pytest.skip("the container's processes are not this user's to kill")
+    time.sleep(1)
+    server.wait_until_ready(90)
+    for job in jobs:
+        while (state := server.get(f"{job}?wait=60").json()["state"]) in ("queued", "running"):
+            pass
+        assert state == "done"
+    results = {server.get(f"{job}/result").body for job in jobs}
+    assert results == {server.post("/filter?iterations=1", body).body}
+
+
+def test_a_killed_worker_is_replaced(stack: tuple[Server, Server, str]) -> None:
+    server, _, container = stack
+    script = (
+        "import os, pathlib, signal\n"
+        "for number in pathlib.Path('/proc/1/task/1/children').read_text().split():\n"
+        "    if b'spawn_main' in pathlib.Path(f'/proc/{number}/cmdline').read_bytes():\n"
+        "        os.kill(int(number), signal.SIGKILL)"
+    )
+    run("docker", "exec", container, "python3", "-c", script)
+    assert server.post("/filter?iterations=1", NOISY.read_bytes()).status == 200
+    assert server.get("/health/live").status == 200
+
+
+def test_the_image_is_not_large(image: str) -> None:
+    base = os.environ.get("POINTFILTER_TEST_PYTHON_IMAGE", "python:3.11-slim")
+    size, under = (int(run("docker", "image", "inspect", "--format", "{{.Size}}", name)) for name in (image, base))
+    print(f"image: {size / 1e6:.0f} MB, {(size - under) / 1e6:.0f} MB above its base")
+    assert size - under <= 550e6
+
+
+def test_the_image_lists_its_parts_and_their_licences(image: str) -> None:
+    listed = json.loads(run("docker", "run", "--rm", "--network", "none", image, "cat", f"{NOTICES}/sbom.json"))
+    assert listed["bomFormat"] == "CycloneDX"
+    licences = {part["name"]: part.get("licenses") for part in listed["components"]}
+    assert {"plyfile", "numpy", "onnxruntime", "fastapi", "huey"} <= licences.keys()
+    assert all(licences[name] for name in ("plyfile", "numpy", "fastapi"))
+    assert "plyfile" in run("docker", "run", "--rm", "--network", "none", image, "cat", f"{NOTICES}/NOTICE")
+
+
+@pytest.mark.parametrize("overlay", ["compose.gpu.yaml", "compose.replicas.yaml"])
+def test_the_overlays_fit(overlay: str) -> None:
+    compose = compose_command()
+    if compose is None:
+        pytest.skip("no docker compose on this machine")
+    profiles = ["--profile", "dashboard"]
+    merged = json.loads(run(*compose, "-f", "compose.yaml", "-f", overlay, *profiles, "config", "--format", "json"))
+    for name, service in merged["services"].items():
+        assert service["read_only"], name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["mem_limit"], name
+        for port in service.get("ports", []):
+            assert port["host_ip"] == "127.0.0.1", name
+    assert ("ports" in merged["services"]["pointfilter"]) is (overlay == "compose.gpu.yaml")
+
+
+def test_the_dockerfile_follows_the_rules() -> None:
+    if not shutil.which("hadolint"):
+        pytest.skip("no hadolint on this machine")
+    run("hadolint", "docker/Dockerfile")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import threading
 import time
 from collections.abc import Callable
@@ -13,7 +14,10 @@ from starlette.testclient import TestClient
 import service.work
 from pointfilter import PointCloud
 from pointfilter.errors import FilteringCancelledError
+from service import worker
+from service.crew import Hand
 from service.house import House
+from service.settings import Settings
 
 
 class Gate:
@@ -52,3 +56,10 @@ def house_of(client: TestClient) -> House:
 def metric(client: TestClient, name: str, **labels: str) -> float:
     """A sample's value; 0 for one that is not there yet."""
     return house_of(client).telemetry.registry.get_sample_value(name, labels) or 0.0
+
+
+def start_thread(settings: Settings) -> Hand:
+    """A worker in a thread of this process, in place of one in a process of its own. It cannot be killed."""
+    ours, theirs = multiprocessing.Pipe()
+    threading.Thread(target=worker.run, args=(theirs, settings), name="worker", daemon=True).start()
+    return Hand(ours, lambda: None)

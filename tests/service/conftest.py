@@ -18,7 +18,7 @@ import service.work
 from pointfilter import PointCloud
 from service.app import create_app
 from service.settings import Settings
-from tests.service.apps import Gate, until
+from tests.service.apps import Gate, start_thread, until
 
 PATCH_POINTS = 32
 
@@ -66,11 +66,27 @@ def temp_dir(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def make_settings(bundles: Path, temp_dir: Path) -> Callable[..., Settings]:
+def data_dir(tmp_path: Path) -> Path:
+    """Where the app under test keeps jobs."""
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def make_settings(bundles: Path, temp_dir: Path, data_dir: Path) -> Callable[..., Settings]:
+    """One worker, small clouds without one of their own, unless said otherwise."""
+
     def make(**values: Any) -> Settings:
-        return Settings(**{"model_dir": bundles, "model": "tiny", "temp_dir": temp_dir, "threads": 1, **values})
+        given = {"model_dir": bundles, "model": "tiny", "temp_dir": temp_dir, "data_dir": data_dir, "threads": 1}
+        return Settings(**{**given, "small_bytes": 0, **values})
 
     return make
+
+
+@pytest.fixture(autouse=True)
+def workers_are_threads(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers inside the test's process, unless a test is marked `processes`: faster, and they can be patched."""
+    if "processes" not in request.keywords:
+        monkeypatch.setattr("service.crew.start_process", start_thread)
 
 
 @pytest.fixture

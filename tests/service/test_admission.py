@@ -51,6 +51,31 @@ def test_workers_are_given_in_order_and_never_more_than_there_are() -> None:
     assert (admission.running, admission.waiting) == (0, 0)
 
 
+def test_small_ones_have_a_worker_more() -> None:
+    admission = Admission(workers=1, queue_size=10, express=1)
+    order: list[str] = []
+
+    async def one(name: str, small: bool, until: asyncio.Event) -> None:
+        async with admission.worker(small):
+            order.append(name)
+            await until.wait()
+
+    async def play() -> None:
+        end = asyncio.Event()
+        work = [
+            asyncio.create_task(one(name, name.startswith("small"), end))
+            for name in ("large 1", "large 2", "small 1", "small 2")
+        ]
+        await asyncio.sleep(0.02)
+        assert order == ["large 1", "small 1"]
+        assert admission.waiting == 2
+        end.set()
+        await asyncio.gather(*work)
+        assert order == ["large 1", "small 1", "large 2", "small 2"]
+
+    asyncio.run(play())
+
+
 def test_one_who_gives_up_waiting_takes_no_worker() -> None:
     admission = Admission(workers=1, queue_size=5)
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from pointfilter import Engine
 from pointfilter.errors import InvalidModelError, ModelNotFoundError
 from service.engines import Engines
 from service.settings import Settings
@@ -16,12 +15,11 @@ from tests.service.conftest import write_bundle
 
 
 def test_a_model_is_loaded_once(make_settings: Callable[..., Settings]) -> None:
-    loaded: list[list[str]] = []
-    engines = Engines(make_settings(), lambda now: loaded.append([engine.bundle.name for engine in now]))
+    engines = Engines(make_settings())
     with ThreadPoolExecutor(8) as pool:
         found = set(pool.map(lambda _: id(engines.engine("tiny")), range(32)))
     assert len(found) == 1
-    assert loaded == [["tiny"]]
+    assert [engine.bundle.name for engine in engines.loaded()] == ["tiny"]
 
 
 def test_the_one_used_longest_ago_makes_room_and_never_the_default(
@@ -29,16 +27,10 @@ def test_the_one_used_longest_ago_makes_room_and_never_the_default(
 ) -> None:
     for name in ("tiny", "a", "b", "c"):
         write_bundle(tmp_path / "many" / name)
-    now: Sequence[Engine] = []
-
-    def note(engines: Sequence[Engine]) -> None:
-        nonlocal now
-        now = engines
-
-    engines = Engines(make_settings(model_dir=tmp_path / "many", max_models=3), note)
+    engines = Engines(make_settings(model_dir=tmp_path / "many", max_models=3))
     for name in ("tiny", "a", "b", "a", "c"):
         engines.engine(name)
-    assert {engine.bundle.name for engine in now} == {"tiny", "a", "c"}
+    assert {engine.bundle.name for engine in engines.loaded()} == {"tiny", "a", "c"}
 
 
 def test_unknown_and_damaged(make_settings: Callable[..., Settings]) -> None:

@@ -70,6 +70,8 @@ def test_models_default_first_and_damaged_ones_left_out(client: TestClient) -> N
     assert "broken" not in [model["name"] for model in models]
     assert client.get("/models/other").json() == models[1]
     assert re.fullmatch(r"[0-9a-f]{64}", models[0]["sha256"])
+    assert [model["provider"] for model in models[:2]] == ["CPUExecutionProvider", None]
+    assert models[0]["precision"] == "float32"
 
 
 def test_version(client: TestClient) -> None:

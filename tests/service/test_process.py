@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import http.client
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -14,8 +16,9 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +68,9 @@ class Running:
 @contextmanager
 def process(bundles: Path, folder: Path, **settings: object) -> Iterator[Running]:
     """A process that has logged its first lines; killed at the end if it still runs."""
-    values = {"port": 0, "model_dir": bundles, "model": "tiny", "temp_dir": folder, "threads": 1, **settings}
+    data = folder.parent / "data"
+    values = {"port": 0, "model_dir": bundles, "model": "tiny", "temp_dir": folder, "data_dir": data, "threads": 1}
+    values |= settings
     environment = {name: value for name, value in os.environ.items() if not name.startswith("POINTFILTER_")}
     environment |= {f"POINTFILTER_{name.upper()}": str(value) for name, value in values.items()}
     log = folder.parent / "service.log"
@@ -79,23 +84,22 @@ def process(bundles: Path, folder: Path, **settings: object) -> Iterator[Running
         child.wait(10)
 
 
+def is_listening(found: Running) -> bool:
+    assert found.process.poll() is None, found.log.read_text(encoding="utf-8")
+    port = re.search(r"http://127\.0\.0\.1:(\d+)", found.log.read_text(encoding="utf-8"))
+    found.port = int(port[1]) if port else 0
+    return port is not None and found.get("/health/ready")[0] == 200
+
+
 @pytest.fixture
 def running(bundles: Path, temp_dir: Path) -> Iterator[Callable[..., Running]]:
     """Starts a ready process."""
-    from contextlib import ExitStack
-
     with ExitStack() as stack:
 
         def start(**settings: object) -> Running:
             found = stack.enter_context(process(bundles, temp_dir, **settings))
 
-            def listening() -> bool:
-                assert found.process.poll() is None, found.log.read_text(encoding="utf-8")
-                port = re.search(r"http://127\.0\.0\.1:(\d+)", found.log.read_text(encoding="utf-8"))
-                found.port = int(port[1]) if port else 0
-                return port is not None and found.get("/health/ready")[0] == 200
-
-            until(listening, 60)
+            until(partial(is_listening, found), 60)
             return found
 
         yield start
@@ -116,6 +120,89 @@ def begin(running: Running, body: bytes, query: str = "") -> socket.socket:
     head = f"POST /filter{query} HTTP/1.1\r\nHost: here\r\nContent-Length: {len(body)}\r\n\r\n"
     connection.sendall(head.encode() + body)
     return connection
+
+
+def job_states(running: Running, jobs: list[str]) -> list[str]:
+    return [json.loads(running.get(f"/jobs/{job}")[1])["state"] for job in jobs]
+
+
+def test_a_killed_service_loses_no_job(
+    bundles: Path, temp_dir: Path, running: Callable[..., Running], long_work: bytes, ply: bytes
+) -> None:
+    query = "?iterations=4&radius=0.03"
+    first = running()
+    jobs = []
+    for body in (long_work, ply, long_work, ply):
+        status, answer = first.send("POST", f"/jobs{query}", body)
+        assert status == 202
+        jobs.append(json.loads(answer)["id"])
+    until(lambda: "running" in job_states(first, jobs))
+    first.process.kill()
+    first.process.wait(10)
+    second = running()
+    until(lambda: job_states(second, jobs) == ["done"] * 4, 120)
+    results = [second.get(f"/jobs/{job}/result") for job in jobs]
+    expected = [second.post(body, query)[1] for body in (long_work, ply)]
+    assert results == [(200, expected[0]), (200, expected[1])] * 2
+
+
+def test_replicas_share_the_jobs_through_redis(
+    bundles: Path, temp_dir: Path, tmp_path: Path, long_work: bytes, ply: bytes
+) -> None:
+    if not shutil.which("redis-server"):
+        pytest.skip("no redis-server on this machine (Debian: apt-get install redis-server)")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    command = ["redis-server", "--port", str(port), "--save", "", "--dir", str(tmp_path)]
+    redis = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        with ExitStack() as stack:
+            replicas = []
+            for number in range(2):
+                folder = tmp_path / f"replica{number}" / "temporary"
+                folder.mkdir(parents=True)
+                settings = {"redis_url": f"redis://127.0.0.1:{port}/0", "data_dir": tmp_path / "shared"}
+                replicas.append(stack.enter_context(process(bundles, folder, **settings)))
+            for replica in replicas:
+                until(partial(is_listening, replica), 60)
+            one, two = replicas
+            query = "?iterations=4&radius=0.03"
+            jobs = [json.loads(one.send("POST", f"/jobs{query}", body)[1])["id"] for body in (long_work, ply) * 3]
+            until(lambda: job_states(two, jobs).count("running") >= 2, 30)
+            one.process.kill()
+            until(lambda: job_states(two, jobs) == ["done"] * 6, 120)
+            assert {two.get(f"/jobs/{job}/result")[1] for job in jobs[1::2]} == {two.post(ply, query)[1]}
+    finally:
+        redis.terminate()
+        redis.wait(10)
+
+
+def test_a_small_job_is_not_behind_a_large_one(running: Callable[..., Running], long_work: bytes, ply: bytes) -> None:
+    service = running()
+    large = json.loads(service.send("POST", "/jobs?iterations=10&radius=0.2", long_work)[1])["id"]
+    until(lambda: job_states(service, [large]) == ["running"])
+    started = time.monotonic()
+    small = json.loads(service.send("POST", "/jobs", ply)[1])["id"]
+    assert json.loads(service.get(f"/jobs/{small}?wait=20")[1])["state"] == "done"
+    assert time.monotonic() - started < 5
+    assert job_states(service, [large]) == ["running"]
+    started = time.monotonic()
+    assert service.send("DELETE", f"/jobs/{large}")[0] == 204
+    assert time.monotonic() - started < 3
+    assert job_states(service, [large]) == ["cancelled"]
+
+
+def test_keys_are_made_by_a_command() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "service", "key", "ann"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    name, digest = done.stdout.split()
+    key = done.stderr.split()[-1]
+    assert (name, digest) == ("ann", hashlib.sha256(key.encode()).hexdigest())
+    for arguments in (["key"], ["key", "a b"], ["kay", "ann"]):
+        done = subprocess.run([sys.executable, "-m", "service", *arguments], cwd=ROOT, capture_output=True, check=False)
+        assert done.returncode == 2
+        assert done.stderr
 
 
 def in_progress(running: Running) -> object:

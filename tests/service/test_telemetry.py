@@ -25,6 +25,12 @@ NAMES = {
     "pointfilter_points": "counter",
     "pointfilter_points_per_request": "histogram",
     "pointfilter_model_info": "gauge",
+    "pointfilter_jobs": "counter",
+    "pointfilter_job_duration_seconds": "histogram",
+    "pointfilter_jobs_waiting": "gauge",
+    "pointfilter_jobs_running": "gauge",
+    "pointfilter_worker_deaths": "counter",
+    "pointfilter_worker_memory_bytes": "gauge",
     "process_resident_memory_bytes": "gauge",
     "python_info": "gauge",
 }

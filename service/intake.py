@@ -1,0 +1,88 @@
+"""How a request's body becomes a job."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+
+from service.errors import JobsFullError
+from service.exchange import exchange_of
+from service.house import House
+from service.records import Record
+from service.settings import variable
+from service.status import JobStatus, described
+from service.upload import Upload, adopt, receive_upload
+from service.work import Order
+
+JOB_CODES = (
+    "malformed-request", "unauthorized", "model-not-found", "slow-transfer", "limit-exceeded", "unsupported-coding",
+    "parameter-out-of-range", "queue-full", "jobs-full", "client-closed", "internal-error", "invalid-model",
+    "not-ready", "draining", "storage-full",
+)  # fmt: skip
+_HEADERS = {"Location": {"description": "Address of the job", "schema": {"type": "string"}}}
+ACCEPTED: dict[str, Any] = {
+    "description": "Accepted: the job's status, and its address in Location",
+    "model": JobStatus,
+    "headers": _HEADERS,
+}
+
+
+async def accept(
+    request: Request, house: House, caller: str | None, order: Order, upload: Upload | None = None
+) -> Record:
+    """Makes a job of the request's body, or of one that arrived already. Raises JobsFullError and as receive_upload."""
+    await asyncio.to_thread(_check_room, house, caller)
+    incoming = await asyncio.to_thread(house.jobs.begin)
+    try:
+        if upload is None:
+            upload = await receive_upload(request, incoming.source, house.settings)
+        else:
+            await asyncio.to_thread(adopt, upload, incoming.source)
+        record = Record(
+            id=incoming.id,
+            created=time.time(),
+            order=order,
+            file_name=upload.file_name,
+            small=upload.size <= house.settings.small_bytes,
+            owner=caller,
+            request_id=exchange_of(request.scope).request_id,
+        )
+        await asyncio.shield(asyncio.to_thread(house.jobs.accept, incoming, record))
+    except BaseException:
+        await asyncio.to_thread(incoming.remove)
+        raise
+    house.runner.wake()
+    return record
+
+
+def accepted(request: Request, record: Record) -> Response:
+    status = described(request, record, None, None)
+    return JSONResponse(status.model_dump(mode="json"), 202, {"Location": status.href})
+
+
+def _check_room(house: House, caller: str | None) -> None:
+    """Raises JobsFullError."""
+    settings = house.settings
+    waiting = house.jobs.queued()
+    if waiting >= settings.job_queue_size:
+        raise JobsFullError(
+            f"{waiting} jobs are waiting, as many as this service keeps",
+            limit=settings.job_queue_size,
+            actual=waiting + 1,
+            hint=f"try again later; whoever runs the service can raise {variable('job_queue_size')}",
+            retry_after=house.runner.retry_after(),
+        )
+    if settings.jobs_per_key and caller is not None:
+        unfinished = house.jobs.unfinished(caller)
+        if unfinished >= settings.jobs_per_key:
+            raise JobsFullError(
+                f"{unfinished} jobs of this API key are not finished, as many as it may have",
+                limit=settings.jobs_per_key,
+                actual=unfinished + 1,
+                hint=f"whoever runs the service can raise {variable('jobs_per_key')}",
+                retry_after=house.runner.retry_after(),
+            )

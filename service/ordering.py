@@ -1,0 +1,73 @@
+"""What a request asks for: its query parameters, checked before its upload is read."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from typing import Annotated, Literal
+
+from fastapi import Depends, Query
+
+from pointfilter.errors import ParameterError
+from pointfilter.models import AUTO, Auto
+from pointfilter.pipeline import Radius
+from service.dependencies import CallerDep, ExchangeDep, HouseDep
+from service.settings import variable
+from service.work import Order
+
+
+async def _order(
+    house: HouseDep,
+    exchange: ExchangeDep,
+    _caller: CallerDep,
+    model: Annotated[str | None, Query(description="A name from /models", max_length=100)] = None,
+    iterations: Annotated[
+        str | None,
+        Query(
+            description="Passes over the cloud, a number from 1 on, or auto for as many as it needs; by default the "
+            "model's",
+            json_schema_extra={"pattern": "^(auto|[1-9][0-9]*)$"},
+        ),
+    ] = None,
+    radius: Annotated[
+        str | None,
+        Query(
+            description="Patch radius: a share of the bounding box's diagonal (5%, in an address 5%25) or a length in "
+            "the unit of the file (0.02); by default the model's",
+            max_length=40,
+        ),
+    ] = None,
+    seed: Annotated[int, Query(description="Of the choice of neighbours in dense patches", ge=0, lt=2**63)] = 0,
+    format: Annotated[  # noqa: A002 - the parameter's public name
+        Literal["same", "ascii", "binary_little_endian", "binary_big_endian"],
+        Query(description="Encoding of the answer"),
+    ] = "same",
+) -> Order:
+    """Raises ParameterError, ModelError."""
+    bundle = await asyncio.to_thread(house.engines.bundle, model or house.settings.model)
+    exchange.model = bundle.name
+    return Order(
+        model=bundle.name,
+        iterations=None if iterations is None else _iterations(iterations, house.settings.max_iterations),
+        radius=None if radius is None else Radius.parse(radius),
+        seed=seed,
+        encoding=format,
+    )
+
+
+OrderDep = Annotated[Order, Depends(_order)]
+
+
+def _iterations(text: str, most: int) -> int | Auto:
+    """Raises ParameterError."""
+    if text == AUTO:
+        return AUTO
+    number = int(text) if re.fullmatch(r"-?[0-9]{1,9}", text) else None
+    if number is None or not 1 <= number <= most:
+        raise ParameterError(
+            f"iterations must be auto or a number from 1 to {most}, got {text[:40]}",
+            limit=most,
+            actual=text[:40] if number is None else number,
+            hint=f"whoever runs the service can raise {variable('max_iterations')}",
+        )
+    return number
