@@ -9,6 +9,7 @@ import os
 import pickle
 import signal
 import threading
+import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
@@ -24,6 +25,7 @@ from service.logs import configure_logging
 from service.settings import Settings
 from service.work import Delivery, Order, carry_out
 
+PROGRESS_SECONDS = 0.1  # how often it says how far it is
 OUT_OF_MEMORY_SCORE = 500  # the kernel is to take a worker before it takes the service
 
 
@@ -132,8 +134,13 @@ def _answer(
 ) -> Done | Failed:
     token = current_request_id.set(task.request_id)
 
+    told = float("-inf")
+
     def progress(done: int, total: int, points: int) -> None:
-        connection.send(Progress(done, total, points))
+        nonlocal told
+        if time.monotonic() - told >= PROGRESS_SECONDS or done == total:
+            told = time.monotonic()
+            connection.send(Progress(done, total, points))
 
     try:
         delivery = carry_out(

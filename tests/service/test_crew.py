@@ -50,7 +50,7 @@ def source(tmp_path: Path, ply: bytes) -> Path:
 def long_source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A cloud that takes seconds."""
     path = tmp_path_factory.mktemp("long") / "long.ply"
-    PointCloud(np.random.default_rng(0).uniform(size=(60_000, 3))).write(path)
+    PointCloud(np.random.default_rng(0).uniform(size=(20_000, 3))).write(path)
     return path
 
 
