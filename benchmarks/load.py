@@ -85,10 +85,11 @@ class Supervised:
         return subprocess.Popen([sys.executable, "-m", "service"], env=self._environment, stderr=self._log)
 
     def workers(self) -> list[int]:
-        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        with contextlib.suppress(OSError):
-            return [int(text) for text in children.read_text().split() if _is_worker(int(text))]
-        return []
+        found: list[int] = []
+        for children in Path(f"/proc/{self.process.pid}/task").glob("*/children"):  # each thread has its own
+            with contextlib.suppress(OSError):
+                found += [int(text) for text in children.read_text().split() if _is_worker(int(text))]
+        return found
 
     def memory(self) -> float:
         return sum(_resident(pid) for pid in [self.process.pid, *self.workers()])

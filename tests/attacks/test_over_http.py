@@ -28,7 +28,7 @@ LORISES = 200
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, int]]:
     """The server and its process's number."""
     folder = tmp_path_factory.mktemp("service")
-    limits = {"POINTFILTER_MAX_UPLOAD_BYTES": str(LARGEST), "POINTFILTER_TEMP_DIR": str(folder)}
+    limits = {"POINTFILTER_MAX_UPLOAD_BYTES": str(LARGEST), "POINTFILTER_MAX_POINTS": "2000000000"}
     with running_service(folder, **limits) as (server, process):
         server.post("/filter?radius=1", GOOD)  # both workers have been at work once
         yield server, process.pid
@@ -36,8 +36,10 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, 
 
 def resident(pid: int) -> float:
     """Bytes of a process and its children."""
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    pages = sum(int(Path(f"/proc/{number}/statm").read_text().split()[1]) for number in [str(pid), *children])
+    lists = Path(f"/proc/{pid}/task").glob("*/children")  # each thread has its own
+    processes = [str(pid), *(number for children in lists for number in children.read_text().split())]
+    assert len(processes) >= 3  # with two workers
+    pages = sum(int(Path(f"/proc/{number}/statm").read_text().split()[1]) for number in processes)
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 

@@ -161,9 +161,12 @@ def test_a_killed_worker_is_replaced(stack: tuple[Server, Server, str]) -> None:
     server, _, container = stack
     script = (
         "import os, pathlib, signal\n"
-        "for number in pathlib.Path('/proc/1/task/1/children').read_text().split():\n"
-        "    if b'spawn_main' in pathlib.Path(f'/proc/{number}/cmdline').read_bytes():\n"
-        "        os.kill(int(number), signal.SIGKILL)"
+        "killed = 0\n"
+        "for path in pathlib.Path('/proc').glob('[0-9]*/cmdline'):\n"
+        "    if b'spawn_main' in path.read_bytes():\n"
+        "        os.kill(int(path.parent.name), signal.SIGKILL)\n"
+        "        killed += 1\n"
+        "assert killed == 2, killed"
     )
     run("docker", "exec", container, "python3", "-c", script)
     assert server.post("/filter?iterations=1", NOISY.read_bytes()).status == 200

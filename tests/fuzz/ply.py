@@ -14,7 +14,8 @@ from pathlib import Path
 
 import atheris
 
-with atheris.instrument_imports(include=["pointfilter"]):
+with atheris.instrument_imports(include=["pointfilter", "plyfile"]):
+    import pointfilter.formats.ply  # noqa: F401 - else it is loaded when the first file is, and nothing looks into it
     from pointfilter import PointCloud
     from pointfilter.errors import InputError
 

@@ -41,7 +41,7 @@ def test_the_page_can_be_used_without_a_mouse_or_eyes(client: TestClient) -> Non
     assert 'role="alert"' in page
     fields = re.findall(r"<(?:input|select)\s[^>]*>", page)
     labels = re.findall(r"<label.*?</label>", page, re.DOTALL)
-    assert len(fields) == 5
+    assert len(fields) == 6
     assert all(any(field in label for label in labels) for field in fields)
 
 
