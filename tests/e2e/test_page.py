@@ -86,10 +86,10 @@ def test_it_says_how_far_it_is_and_stops_when_told(page: object, service: Server
     with page.expect_response(lambda answer: "/jobs?" in answer.url) as answer:  # type: ignore[attr-defined]
         page.click("#go")  # type: ignore[attr-defined]
     href = answer.value.headers["location"]
-    page.wait_for_function("document.getElementById('status').textContent.includes('pass 1 of 10')", timeout=60_000)  # type: ignore[attr-defined]
+    page.wait_for_selector("#status:has-text('pass 1 of 10')", timeout=60_000)  # type: ignore[attr-defined]
     assert 0 <= float(page.get_attribute("#progress", "value")) < 1  # type: ignore[attr-defined]
     page.click("#stop")  # type: ignore[attr-defined]
-    page.wait_for_function("document.getElementById('status').textContent === 'Stopped.'")  # type: ignore[attr-defined]
+    page.wait_for_selector("#status:has-text('Stopped.')")  # type: ignore[attr-defined]
     for _ in range(100):
         if (state := service.get(href).json()["state"]) == "cancelled":
             break
