@@ -16,6 +16,7 @@ from service.middleware import ExchangeMiddleware
 from service.problems import Problem
 from service.routes import about, filter, health, jobs, pages  # noqa: A004 - named after what it routes
 from service.settings import Settings
+from service.tracing import tracing
 
 DESCRIPTION = """Noisy point clouds in, clean ones out: sharp edges and every attribute kept.
 
@@ -26,7 +27,8 @@ them.
 
 def create_app(settings: Settings | None = None) -> FastAPI:
     """An app with its own models, queue and metrics. settings: by default from the environment."""
-    house = House(settings or Settings())
+    settings = settings or Settings()
+    house = House(settings)
     app = FastAPI(
         title="Pointfilter",
         version=pointfilter.__version__,
@@ -34,6 +36,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         lifespan=_lifespan,
         docs_url=None,  # routes/pages.py has /docs, with a content security policy
         redoc_url=None,
+        telemetry=tracing(settings),
     )
     app.state.house = house
     app.add_middleware(ExchangeMiddleware, house=house)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from pointfilter.limits import ReadLimits
@@ -118,6 +119,16 @@ class Settings(BaseSettings):
     log_format: Literal["json", "text"] = "json"
     """One JSON object a line, or text for people."""
 
+    traces: bool = False
+    """Send OpenTelemetry traces (OTLP over HTTP) to where OTEL_EXPORTER_OTLP_ENDPOINT says; needs the extra `traces`."""
+
+    @field_validator("traces")
+    @classmethod
+    def _can_be_sent(cls, traces: bool) -> bool:
+        if traces and not all(map(_installed, ("opentelemetry.sdk", "opentelemetry.exporter.otlp.proto.http"))):
+            raise ValueError("traces need the extra: pip install 'pointfilter[service,traces]'")
+        return traces
+
     @property
     def job_folder(self) -> Path:
         """Where jobs lie."""
@@ -129,6 +140,13 @@ class Settings(BaseSettings):
     @property
     def read_limits(self) -> ReadLimits:
         return ReadLimits(max_points=self.max_points, max_points_knob=variable("max_points"))
+
+
+def _installed(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # not even its parent
+        return False
 
 
 def variable(field: str) -> str:

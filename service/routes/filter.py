@@ -17,6 +17,7 @@ from service.ordering import OrderDep
 from service.problems import answers
 from service.records import Outcome
 from service.settings import variable
+from service.tracing import note_work
 from service.upload import FILE_BODY, receive_upload
 from service.work import cancelled_on_disconnect, in_worker
 
@@ -96,6 +97,7 @@ async def filter_file(
             "this process had to end before the result was there; the work was stopped", hint="send the request again"
         ) from None
     house.telemetry.delivered(delivery)
+    note_work(delivery)
     exchange.points = delivery.report.points
     return FileDownload(
         target,
