@@ -74,7 +74,7 @@ class Supervised:
         temporary.mkdir()
         values = {
             "port": self.port, "data_dir": folder / "data", "temp_dir": temporary, "device": device,
-            "log_level": "error", "job_queue_size": 1_000,
+            "log_level": "error", "job_queue_size": 100,
         }  # fmt: skip
         self._environment = os.environ | {f"POINTFILTER_{name.upper()}": str(value) for name, value in values.items()}
         self._log = (folder / "service.log").open("ab")
