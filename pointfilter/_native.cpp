@@ -149,13 +149,13 @@ class Neighbourhood {
     }
   }
 
-  // A level that is not too high to begin with: a ball fills more than an eighth of its cells, mostly.
+  // A level that is not too high to begin with: a ball fills more than a sixth of its cells, mostly.
   void guess(size_t enough) {
     fresh_ = false;
     int64_t total = 0;
     for (const Cell& cell : cells_) total += cell.end - cell.start;
     int level = 0;
-    while (level < kHighestLevel && static_cast<size_t>(total >> level) > 8 * enough) ++level;
+    while (level < kHighestLevel && static_cast<size_t>(total >> level) > 6 * enough) ++level;
     set_level(level);
   }
 
