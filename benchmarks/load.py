@@ -9,8 +9,8 @@ as requests, half as jobs; one client in ten vanishes. Every result is compared,
 answered when it was idle; every job that was accepted must be done in the end, once.
 
 Prints what it measured: throughput, latency of what was answered well, how the rest ended, latency of /health/live
-while the service is up, memory of the service and its workers. Exit code 1 when a job was lost, a byte was wrong, or an
-answer was none that is documented.
+while the service is up, memory of the service and its workers. Exit code 1 when a job was lost, a byte was wrong, an
+answer was none that is documented or came too late, or a bar on /health/live or memory was not met.
 """
 
 from __future__ import annotations
@@ -43,6 +43,10 @@ POINTS = 2_000
 VANISHING = 0.1
 JOBS = 0.5
 LIVE_SECONDS = 0.1
+LIVE_TIMEOUT_SECONDS = 5.0
+ANSWER_SECONDS = 120.0
+LIVE_BAR = 0.1  # seconds, of the 99th percentile
+MEMORY_BAR = 1.1  # after the load, of what it was before
 MEMORY_SECONDS = 1.0
 DOCUMENTED = {200, 202, 429, 503, 504}
 SETTLE_SECONDS = 300.0
@@ -128,7 +132,7 @@ def main(arguments: list[str] | None = None) -> int:
     rows = asyncio.run(_run(options))
     if options.json:
         options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
-    return 1 if any(row["lost"] or row["wrong"] for row in rows) else 0
+    return 1 if any(row["lost"] or row["wrong"] or row["not_met"] for row in rows) else 0
 
 
 async def _run(options: argparse.Namespace) -> list[dict[str, Any]]:
@@ -142,7 +146,7 @@ async def _run(options: argparse.Namespace) -> list[dict[str, Any]]:
         try:
             limits = httpx.Limits(max_connections=None)
             async with httpx.AsyncClient(
-                base_url=service.address, timeout=120, limits=limits, trust_env=False
+                base_url=service.address, timeout=ANSWER_SECONDS, limits=limits, trust_env=False
             ) as client:
                 keeper = asyncio.create_task(service.keep_up(client))
                 while not service.is_up:
@@ -224,6 +228,9 @@ async def _one(
     except TimeoutError:
         tally.ended["vanished"] += 1
         return
+    except httpx.TimeoutException:
+        tally.wrong.append(f"no answer within {ANSWER_SECONDS:g} s")
+        return
     except httpx.HTTPError as error:
         tally.ended[f"no answer ({type(error).__name__})"] += 1  # the service was killed
         return
@@ -267,9 +274,16 @@ async def _watch_live(client: httpx.AsyncClient, service: Supervised, tally: Tal
     while True:
         if service.is_up:
             started = time.perf_counter()
-            with contextlib.suppress(httpx.HTTPError):
-                await client.get("/health/live")
+            try:
+                status = (await client.get("/health/live", timeout=LIVE_TIMEOUT_SECONDS)).status_code
+            except httpx.TimeoutException:
+                tally.wrong.append(f"no /health/live within {LIVE_TIMEOUT_SECONDS:g} s")
+            except httpx.HTTPError:
+                tally.ended["live: no answer"] += 1  # the service was killed
+            else:
                 tally.live.append(time.perf_counter() - started)
+                if status != 200:
+                    tally.wrong.append(f"/health/live: {status}")
         await asyncio.sleep(LIVE_SECONDS)
 
 
@@ -295,7 +309,13 @@ def _row(
     def percentiles(values: list[float]) -> dict[str, float]:
         return {f"p{p}": float(np.percentile(values, p)) if values else float("nan") for p in (50, 95, 99)}
 
+    live = percentiles(tally.live)
+    bars = {
+        f"/health/live, p99 at most {1000 * LIVE_BAR:g} ms": live["p99"] <= LIVE_BAR,
+        f"memory at most {MEMORY_BAR:g} of what it was": after <= MEMORY_BAR * before,
+    }
     return {
+        "not_met": [name for name, met in bars.items() if not met],
         "factor": factor,
         "capacity": capacity,
         "seconds": seconds,
@@ -303,7 +323,7 @@ def _row(
         "jobs": len(tally.accepted),
         "throughput": (len(tally.answered) + len(tally.accepted)) / seconds,
         "latency": percentiles(tally.answered),
-        "live": percentiles(tally.live),
+        "live": live,
         "ended": dict(tally.ended),
         "kills": dict(tally.kills),
         "lost": lost,
@@ -328,6 +348,7 @@ def _line(row: dict[str, Any]) -> str:
         f"  answered {row['answered']} ({times(row['latency'])}); jobs accepted {row['jobs']}, lost {row['lost']}\n"
         f"  ended: {ended}\n  killed: {kills}\n  /health/live: {times(row['live'])}\n  memory, MB: {memory}\n"
         + "".join(f"  WRONG: {what}\n" for what in row["wrong"][:10])
+        + "".join(f"  NOT MET: {what}\n" for what in row["not_met"])
     )
 
 

@@ -118,6 +118,8 @@ class Admission:
     def _assign(self) -> None:
         for waiting in list(self._queue):
             small, given = waiting
+            if given.done():  # gave up, and has not come round to say so
+                continue
             lanes = (_Lane.ANY, _Lane.SMALL) if small else (_Lane.ANY,)
             if lane := next((lane for lane in lanes if self._free[lane]), None):
                 self._free[lane] -= 1

@@ -6,13 +6,11 @@ One that dies is replaced, and what it was at is done again; one that does not s
 from __future__ import annotations
 
 import logging
-import multiprocessing
 import os
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -21,6 +19,7 @@ from pointfilter.errors import FilteringCancelledError
 from service import worker
 from service.errors import WorkerDiedError
 from service.exchange import current_request_id
+from service.hands import Hand, start_process
 from service.settings import Settings
 from service.work import Delivery, Order
 
@@ -31,38 +30,6 @@ START_SECONDS = 120.0  # the longest that a worker may take until its model has 
 STOP_SECONDS = 0.5  # from the word to the kill
 RETRY_SECONDS = 10
 LOOK_SECONDS = 0.05  # how often a waiting thread looks whether it shall stop
-
-
-@dataclass
-class Hand:
-    """A worker: our end of its connection, what is in its memory, and how to end it at once."""
-
-    connection: Connection
-    kill: Callable[[], None]
-    pid: int | None = None
-    loaded: tuple[worker.Loaded, ...] = ()
-
-    def end(self) -> None:
-        """Whatever state it is in."""
-        self.connection.close()
-        with suppress(OSError, ValueError):
-            self.kill()
-
-
-def start_process(settings: Settings) -> Hand:
-    """A worker in a process of its own."""
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=worker.run_process, args=(theirs, settings), name="worker", daemon=True)
-    process.start()
-    theirs.close()  # so that its death ends the connection
-
-    def kill() -> None:
-        process.kill()
-        process.join()
-        process.close()
-
-    return Hand(ours, kill, process.pid)
 
 
 class Crew:
@@ -136,13 +103,23 @@ class Crew:
         Raises what the work raised, and WorkerDiedError when workers died of it.
         """
         task = worker.Task(order, source, target, current_request_id.get())
-        for attempt in range(1, ATTEMPTS + 1):
+        attempt = 0
+        while attempt < ATTEMPTS:
             hand = self._take(stop)
             try:
-                answer = self._converse(hand, task, stop, progress)
-            except (EOFError, OSError):
+                hand.connection.send(task)
+            except (OSError, ValueError):  # it was dead before
+                self._retire(hand)
+                continue
+            attempt += 1
+            try:
+                answer = self._converse(hand, stop, progress)
+            except (EOFError, OSError, ValueError):
                 self._retire(hand, attempt)
                 continue
+            except BaseException:
+                self._retire(hand, attempt)  # nobody knows what it will say next
+                raise
             self._free.put(hand)
             if isinstance(answer, worker.Failed):
                 raise answer.error
@@ -171,10 +148,9 @@ class Crew:
         raise FilteringCancelledError("the work was stopped")
 
     def _converse(
-        self, hand: Hand, task: worker.Task, stop: threading.Event, progress: Callable[[int, int, int], None]
+        self, hand: Hand, stop: threading.Event, progress: Callable[[int, int, int], None]
     ) -> worker.Done | worker.Failed:
         """Raises EOFError or OSError when the worker died, or was killed because it did not stop."""
-        hand.connection.send(task)
         told: float | None = None
         while True:
             if stop.is_set():

@@ -32,9 +32,9 @@ class House:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        express = 1 if settings.small_bytes else 0
+        express = 1 if settings.small_points else 0
         self.admission = Admission(settings.workers, settings.queue_size, express, settings.places_per_key)
-        self.telemetry = Telemetry(self.admission)
+        self.telemetry = Telemetry(self.admission, settings.model)
         self.engines = Engines(settings)
         """For looking at bundles; the workers have engines of their own."""
         self.crew = Crew(
@@ -67,6 +67,10 @@ class House:
         if self._drain_until is None:
             self._drain_until = time.monotonic() + self.settings.drain_seconds
 
+    def _left(self) -> float:
+        """Seconds until what is under way must end."""
+        return max(0.0, (self._drain_until or 0.0) - time.monotonic())
+
     @property
     def jobs(self) -> Jobs:
         """Once check_started() has passed."""
@@ -92,13 +96,15 @@ class House:
     async def close(self) -> None:
         """Waits until nobody works any more."""
         self.drain()
-        assert self._drain_until is not None  # noqa: S101
         if self._loading:
-            await asyncio.wait([self._loading])
+            await asyncio.wait([self._loading], timeout=self._left())
+            if not self._loading.done():
+                await asyncio.to_thread(self.crew.close)  # ends the start of a worker, however long it would take
+                await asyncio.wait([self._loading])
         if self._mending:
             self._mending.cancel()
         if self._runner:
-            await self._runner.close(self._drain_until - time.monotonic())
+            await self._runner.close(self._left())
         await asyncio.to_thread(self.executor.shutdown, wait=True, cancel_futures=True)
         await asyncio.to_thread(self.crew.close)
         if self._jobs:
@@ -106,27 +112,30 @@ class House:
 
     async def _load(self) -> None:
         try:
-            await asyncio.to_thread(self._prepare)
+            provider = await asyncio.to_thread(self._prepare)
         except Exception as error:  # noqa: BLE001 - whatever it is, the service must say so and not become ready
-            self._fail(error)
+            if not self.draining:
+                self._fail(error)
             return
         self._runner = Runner(
-            self.jobs, self.settings, self.admission, self.telemetry, self.executor, self.crew.carry_out
-        )
+            self.jobs, self.settings, self.admission, self.telemetry, self.executor, self.crew.carry_out,
+            lambda: self.draining,
+        )  # fmt: skip
         self.telemetry.watch(lambda: self.runner.waiting, lambda: self.runner.running, self.crew.memory)
         if not self.draining:
             self._runner.open()
         self._mending = asyncio.create_task(self._mend())
-        default = self.settings.model
-        self.provider = next(model.provider for model in self.crew.loaded() if model.name == default)
-        log.info("ready", extra={"model": default, "provider": self.provider})
+        self.provider = provider
+        log.info("ready", extra={"model": self.settings.model, "provider": provider})
 
-    def _prepare(self) -> None:
+    def _prepare(self) -> str:
+        """Returns the default model's provider."""
         with tempfile.TemporaryDirectory(prefix="pointfilter-", dir=self.settings.temp_dir) as folder:
             os.statvfs(folder)  # an upload needs a folder that can be written to: better known now
         self._keys = Keys(self.settings.keys_file)
         self._jobs = Jobs(self.settings.job_folder, self.settings.redis_url)
         self.crew.open()
+        return self.crew.loaded()[0].provider
 
     async def _mend(self) -> None:
         while True:

@@ -16,7 +16,7 @@ from service.records import Record
 from service.settings import variable
 from service.status import JobStatus, described
 from service.upload import Upload, adopt, receive_upload
-from service.work import Order
+from service.work import Order, is_small, to_the_end
 
 JOB_CODES = (
     "malformed-request", "unauthorized", "model-not-found", "slow-transfer", "limit-exceeded", "unsupported-coding",
@@ -47,11 +47,11 @@ async def accept(
             created=time.time(),
             order=order,
             file_name=upload.file_name,
-            small=upload.size <= house.settings.small_bytes,
+            small=await asyncio.to_thread(is_small, incoming.source, house.settings.small_points),
             owner=caller,
             request_id=exchange_of(request.scope).request_id,
         )
-        await asyncio.shield(asyncio.to_thread(house.jobs.accept, incoming, record))
+        await to_the_end(house.jobs.accept, incoming, record)
     except BaseException:
         await asyncio.to_thread(incoming.remove)
         raise
@@ -67,7 +67,7 @@ def accepted(request: Request, record: Record) -> Response:
 def _check_room(house: House, caller: str | None) -> None:
     """Raises JobsFullError."""
     settings = house.settings
-    waiting = house.jobs.queued()
+    waiting = house.jobs.waiting()
     if waiting >= settings.job_queue_size:
         raise JobsFullError(
             f"{waiting} jobs are waiting, as many as this service keeps",

@@ -13,96 +13,23 @@ That, not the queue, is why none is lost. Several processes may share the folder
 
 from __future__ import annotations
 
-import fcntl
 import logging
-import os
-import shutil
 import time
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 from huey.storage import BaseStorage, RedisStorage, SqliteStorage
 
 from service.errors import JobNotFoundError
-from service.records import Progress, Record, State
+from service.job import Job, not_found, sync
+from service.records import Record, State
 
 log = logging.getLogger("service.jobs")
 
 ID_LETTERS = frozenset("0123456789abcdef")
 ID_LENGTH = 32
-
-
-class Job:
-    """A folder under jobs/ (or incoming/, as long as its file is still on its way)."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.source = folder / "input.ply"
-        self.target = folder / "output.ply"
-
-    @property
-    def id(self) -> str:
-        return self.folder.name
-
-    def read(self) -> Record:
-        """Raises JobNotFoundError."""
-        try:
-            return Record.model_validate_json((self.folder / "job.json").read_bytes())
-        except (FileNotFoundError, NotADirectoryError):
-            raise not_found() from None
-
-    def write(self, record: Record) -> None:
-        _replace(self.folder / "job.json", record.model_dump_json().encode())
-
-    def progress(self) -> Progress | None:
-        with suppress(OSError, ValueError):
-            return Progress.model_validate_json((self.folder / "progress.json").read_bytes())
-        return None
-
-    def note(self, progress: Progress) -> None:
-        """Not worth waiting for the disk."""
-        _replace(self.folder / "progress.json", progress.model_dump_json().encode(), durable=False)
-
-    def ask_to_cancel(self) -> None:
-        """Whoever works on it looks for this."""
-        with suppress(FileNotFoundError):
-            (self.folder / "cancel").touch()
-
-    def to_be_cancelled(self) -> bool:
-        return (self.folder / "cancel").exists() or not self.folder.exists()
-
-    @contextmanager
-    def locked(self) -> Iterator[bool]:
-        """Whether the lock could be had at once. Another process's, or another thread's, counts alike."""
-        try:
-            descriptor = os.open(self.folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
-        except FileNotFoundError:
-            yield False
-            return
-        try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                yield False
-                return
-            yield True
-        finally:
-            os.close(descriptor)
-
-    def end_if_free(self) -> bool:
-        """Whether the job is over; one that nobody works on is cancelled by this."""
-        with self.locked() as free:
-            record = self.read()
-            if free and not record.state.final:
-                record = record.model_copy(update={"state": State.CANCELLED, "finished": time.time()})
-                self.write(record)
-                self.source.unlink(missing_ok=True)
-            return record.state.final
-
-    def remove(self) -> None:
-        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 class Jobs:
@@ -135,11 +62,11 @@ class Jobs:
 
     def accept(self, incoming: Job, record: Record) -> Job:
         """From here on the job survives whatever happens to the process."""
-        _sync(incoming.source)
+        sync(incoming.source)
         incoming.write(record)
         job = Job(self._folder / incoming.id)
         incoming.folder.rename(job.folder)
-        _sync(self._folder)
+        sync(self._folder)
         try:
             self.requeue(record)
         except Exception:  # a Redis that is away: recover() finds the job, so it is not lost
@@ -157,9 +84,14 @@ class Jobs:
         name = self._queues[small].dequeue()
         return None if name is None else Job(self._folder / bytes(name).decode())
 
-    def queued(self, small: bool | None = None) -> int:
-        """Jobs in one of the queues, or in both."""
-        return sum(queue.queue_size() for which, queue in self._queues.items() if small in (None, which))
+    def queued(self, small: bool) -> int:
+        """Names in a queue, those of jobs that were cancelled meanwhile too."""
+        size: int = self._queues[small].queue_size()
+        return size
+
+    def waiting(self) -> int:
+        """Jobs that are queued."""
+        return sum(record.state is State.QUEUED for _, record in self.all())
 
     def unfinished(self, owner: str | None) -> int:
         """Jobs of an owner that are queued or running."""
@@ -183,6 +115,13 @@ class Jobs:
                     found += 1
         return found
 
+    def remove(self, job: Job) -> None:
+        """In one step, so that no half of a job is left where jobs lie."""
+        away = self._incoming / uuid.uuid4().hex
+        with suppress(FileNotFoundError):
+            job.folder.rename(away)
+            Job(away).remove()
+
     def expire(self, seconds: float, upload_seconds: float) -> int:
         """Removes jobs that ended so long ago, and uploads that never became a job. Returns how many jobs."""
         now = time.time()
@@ -192,7 +131,7 @@ class Jobs:
                     Job(folder).remove()
         old = [job for job, record in self.all() if record.finished is not None and now - record.finished > seconds]
         for job in old:
-            job.remove()
+            self.remove(job)
         return len(old)
 
     def requeue(self, record: Record) -> None:
@@ -201,33 +140,3 @@ class Jobs:
     def close(self) -> None:
         for queue in self._queues.values():
             queue.close()
-
-
-def not_found() -> JobNotFoundError:
-    return JobNotFoundError("there is no job of this name, or it expired")
-
-
-def _replace(path: Path, data: bytes, durable: bool = True) -> None:
-    """Writes a file that is there whole or not at all."""
-    partial = path.with_name(f".{uuid.uuid4().hex}")
-    try:
-        with os.fdopen(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-            file.write(data)
-            if durable:
-                file.flush()
-                os.fsync(file.fileno())
-        partial.replace(path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
-    if durable:
-        _sync(path.parent)
-
-
-def _sync(path: Path) -> None:
-    """Until a file, or the names in a folder, have reached the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

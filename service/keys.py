@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import logging
 import re
 import secrets
 import time
 from pathlib import Path
 
 from service.errors import UnauthorizedError
+
+log = logging.getLogger("service.keys")
 
 LOOK_SECONDS = 1.0
 _LINE = re.compile(r"(?P<name>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<sha256>[0-9a-f]{64})")
@@ -70,16 +73,17 @@ class Keys:
         return names[0]
 
     def _refresh(self) -> None:
-        """Keeps what it knows while the file is gone or damaged: that is somebody's half-done edit."""
+        """Keeps what it knows while the file is gone or damaged, and says so: that is somebody's half-done edit."""
         if time.monotonic() - self._looked < LOOK_SECONDS or self._path is None:
             return
         self._looked = time.monotonic()
         if (stamp := self._stat()) != self._stamp:
+            self._stamp = stamp
             try:
                 self._known = read_keys(self._path)
-            except (OSError, ValueError):
-                return
-            self._stamp = stamp
+            except (OSError, ValueError) as error:
+                why = str(error) if isinstance(error, KeysError) else "it cannot be read"
+                log.error("the file of API keys is not taken over, the keys from before stay valid: %s", why)
 
     def _stat(self) -> tuple[int, int] | None:
         try:

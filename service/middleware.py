@@ -10,14 +10,16 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.errors import DrainingError
 from service.exchange import Exchange, begin_exchange, current_request_id
-from service.house import House
+from service.house import RETRY_SECONDS, House
 from service.problems import problem_response
 
 log = logging.getLogger("service.requests")
 
 LINGER_SECONDS = 10.0
-FILTER_ROUTE = "/filter"
+FILTER_ROUTES = ("/filter", "/jobs")
+METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})  # labels are few
 ACCEPTED = 202
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -96,9 +98,18 @@ class ExchangeMiddleware:
             if exchange.status is not None:
                 raise
             await problem_response(Request(scope), "internal-error")(scope, body.receive, answer)
-        except BaseException:
-            exchange.code = exchange.code or "cancelled"
-            raise
+        except asyncio.CancelledError:
+            task = asyncio.current_task()
+            if not self._house.draining or exchange.status is not None or task is None:
+                exchange.code = exchange.code or "cancelled"
+                raise
+            task.uncancel()  # the server cancels what outlasts the drain; there is just time to say so
+            error = DrainingError(
+                "this process had to end before the answer was there; the work was stopped",
+                hint="send the request again",
+                retry_after=RETRY_SECONDS,
+            )
+            await problem_response(Request(scope), error.code, error)(scope, body.receive, answer)
         finally:
             self._note(exchange, scope, "HEAD" if head else scope["method"])
             current_request_id.reset(token)
@@ -106,8 +117,12 @@ class ExchangeMiddleware:
     def _note(self, exchange: Exchange, scope: Scope, method: str) -> None:
         seconds = time.perf_counter() - exchange.started
         route = getattr(scope.get("route"), "path", None)  # the pattern; the path itself is the client's text
-        if route == FILTER_ROUTE and method == "POST" and exchange.status != ACCEPTED:  # jobs are counted when they end
+        if (
+            route in FILTER_ROUTES and method == "POST" and exchange.status != ACCEPTED
+        ):  # jobs are counted when they end
             self._house.telemetry.filter_ended(exchange, seconds)
+        if method in METHODS and exchange.status is not None:
+            self._house.telemetry.http_ended(method, route or "none", exchange.status, seconds)
         quiet = route is not None and (route.startswith("/health") or route == "/metrics") and exchange.code is None
         log.log(
             logging.DEBUG if quiet else logging.INFO,

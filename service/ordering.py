@@ -47,7 +47,7 @@ async def _order(
     bundle = await asyncio.to_thread(house.engines.bundle, model or house.settings.model)
     exchange.model = bundle.name
     return Order(
-        model=bundle.name,
+        model=model or house.settings.model,
         iterations=None if iterations is None else _iterations(iterations, house.settings.max_iterations),
         radius=None if radius is None else Radius.parse(radius),
         seed=seed,

@@ -15,26 +15,31 @@ from pathlib import Path
 from typing import Any
 
 from service.admission import Admission
-from service.errors import DeadlineError, JobCancelledError, JobNotFoundError
+from service.errors import DeadlineError, JobCancelledError, JobNotFoundError, WorkerDiedError
 from service.exchange import current_request_id
 from service.handlers import explained
-from service.jobs import Job, Jobs
+from service.job import Job
+from service.jobs import Jobs
 from service.problem_types import TYPES
 from service.problems import problem_of
-from service.records import Outcome, Progress, Record, State
+from service.records import Outcome, Record, State
 from service.settings import Settings, variable
 from service.telemetry import Telemetry
-from service.work import Delivery, Order, cancelled_when, in_worker
+from service.work import Delivery, Order, cancelled_when, in_worker, to_the_end
 
 log = logging.getLogger("service.jobs")
 
 POLL_SECONDS = 1.0  # how often the queue is looked at for jobs of other processes
 CANCEL_SECONDS = 0.2  # how often a running job looks whether it shall stop
-PROGRESS_SECONDS = 0.5  # how often its progress is written down
+MOST_ATTEMPTS = 10  # a job that ends the whole process is given up at last
 KEEP_SECONDS = 10.0  # how often lost jobs are looked for
 EXPIRE_SECONDS = 60.0
 
 CarryOut = Callable[[Order, Path, Path, threading.Event, Callable[[int, int, int], None]], Delivery]
+
+
+class _NothingToDoError(Exception):
+    """A worker was had and not needed; as an exception, so that Admission does not measure it."""
 
 
 class Runner:
@@ -48,6 +53,7 @@ class Runner:
         telemetry: Telemetry,
         executor: Executor,
         carry_out: CarryOut,
+        draining: Callable[[], bool] = lambda: False,
     ) -> None:
         self._jobs = jobs
         self._settings = settings
@@ -55,6 +61,7 @@ class Runner:
         self._telemetry = telemetry
         self._executor = executor
         self._carry_out = carry_out
+        self._draining = draining
         self._wake = asyncio.Event()
         self._stopping = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -66,7 +73,7 @@ class Runner:
         self._begin(self._keep())
         for _ in range(self._settings.workers):
             self._begin(self._serve(small_only=False))
-        if self._settings.small_bytes:
+        if self._settings.small_points:
             self._begin(self._serve(small_only=True))
 
     async def close(self, seconds: float) -> None:
@@ -101,7 +108,9 @@ class Runner:
         while not self._stopping.is_set():
             self._wake.clear()
             try:
-                found = await self._serve_one(queues)
+                found = not self._draining() and await self._serve_one(queues)
+            except _NothingToDoError:
+                found = False
             except Exception:  # a full disk, a Redis that is away: it may come back
                 log.exception("the jobs cannot be worked on")
                 found = False
@@ -113,26 +122,26 @@ class Runner:
         """Whether there was a job."""
         for small in queues:
             if await asyncio.to_thread(self._jobs.queued, small):
-                async with self._admission.worker(small) as waited:
-                    if self._stopping.is_set():
-                        return False
+                async with self._admission.worker(small):
+                    if self._stopping.is_set() or self._draining():
+                        raise _NothingToDoError
                     job = await asyncio.to_thread(self._jobs.next, small)
-                    if job is not None:
-                        self._telemetry.waited(waited)
-                        await self._work(job)
-                        return True
+                    if job is None or not await self._work(job):
+                        raise _NothingToDoError
+                    return True
         return False
 
-    async def _work(self, job: Job) -> None:
+    async def _work(self, job: Job) -> bool:
+        """Whether there was anything to do."""
         with ExitStack() as stack:
-            if not await asyncio.to_thread(stack.enter_context, job.locked()):
-                return  # another process is at it, or it is gone
+            if not await to_the_end(stack.enter_context, job.locked()):
+                return False  # another process is at it, or it is gone
             try:
                 record = await asyncio.to_thread(job.read)
             except JobNotFoundError:
-                return
+                return False
             if record.state.final:
-                return
+                return False
             token = current_request_id.set(record.request_id)
             self.running += 1
             try:
@@ -140,21 +149,26 @@ class Runner:
             finally:
                 self.running -= 1
                 current_request_id.reset(token)
+            return True
 
     async def _follow(self, job: Job, record: Record) -> None:
         started = time.time()
         record = record.model_copy(update={"state": State.RUNNING, "started": started, "attempts": record.attempts + 1})
-        await asyncio.to_thread(job.write, record)
+        await to_the_end(job.write, record)
+        self._telemetry.waited(started - record.created)
         end: dict[str, Any]
         try:
+            if record.attempts > MOST_ATTEMPTS:
+                raise WorkerDiedError(
+                    f"{MOST_ATTEMPTS} processes of the service died while they worked on it", limit=MOST_ATTEMPTS
+                )
             async with (
                 asyncio.timeout(self._settings.job_seconds),
                 cancelled_when(_asked_to_end(job), JobCancelledError("the job was cancelled")),
             ):
                 delivery = await in_worker(self._executor, partial(self._in_thread, job, record.order))
         except asyncio.CancelledError:
-            await asyncio.to_thread(job.write, record.model_copy(update={"state": State.QUEUED, "started": None}))
-            await asyncio.to_thread(self._jobs.requeue, record)
+            await to_the_end(self._give_back, job, record)
             log.info("job goes back to the queue", extra={"job": job.id})
             raise
         except JobCancelledError:
@@ -172,22 +186,17 @@ class Runner:
             self._telemetry.delivered(delivery)
             end = {"state": State.DONE, "outcome": Outcome.of(delivery)}
         record = record.model_copy(update={**end, "finished": time.time()})
-        await asyncio.to_thread(_conclude, job, record)
+        await to_the_end(job.conclude, record)
         self._note(record, time.time() - started)
 
+    def _give_back(self, job: Job, record: Record) -> None:
+        """To the queue; this attempt does not count."""
+        update = {"state": State.QUEUED, "started": None, "attempts": record.attempts - 1}
+        job.write(record.model_copy(update=update))
+        self._jobs.requeue(record)
+
     def _in_thread(self, job: Job, order: Order, stop: threading.Event) -> Delivery:
-        started = time.monotonic()
-        written = 0.0
-
-        def progress(done: int, total: int, points: int) -> None:
-            nonlocal written
-            now = time.monotonic()
-            if now - written >= PROGRESS_SECONDS:
-                written = now
-                with contextlib.suppress(OSError):  # removed, or the disk is full: the work itself will tell
-                    job.note(Progress(done=done, total=total, points=points, seconds=now - started))
-
-        return self._carry_out(order, job.source, job.target, stop, progress)
+        return self._carry_out(order, job.source, job.target, stop, job.progress_writer())
 
     def _failed(self, job: Job, record: Record, error: Exception) -> dict[str, Any]:
         code, told = explained(error)
@@ -226,20 +235,11 @@ class Runner:
                     expired = time.monotonic()
                     settings = self._settings
                     await asyncio.to_thread(self._jobs.expire, settings.job_ttl_seconds, 2 * settings.transfer_seconds)
-                self.waiting = await asyncio.to_thread(self._jobs.queued)
+                self.waiting = await asyncio.to_thread(self._jobs.waiting)
             except Exception:
                 log.exception("the jobs cannot be looked at")
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._stopping.wait(), KEEP_SECONDS)
-
-
-def _conclude(job: Job, record: Record) -> None:
-    """The record first: a job whose files are gone would be a lost one."""
-    with contextlib.suppress(FileNotFoundError):  # removed meanwhile
-        job.write(record)
-    job.source.unlink(missing_ok=True)
-    if record.state is not State.DONE:
-        job.target.unlink(missing_ok=True)
 
 
 async def _asked_to_end(job: Job) -> None:

@@ -57,8 +57,8 @@ class Settings(BaseSettings):
     queue_size: Annotated[int, Field(ge=0, le=10_000)] = 8
     """Filter requests that may be in the house beyond those worked on: arriving, waiting or leaving. More get a 429."""
 
-    small_bytes: Annotated[int, Field(ge=0)] = 256 * 1024
-    """Files up to this size have one more worker of their own, so that they need not wait for large ones; 0: they
+    small_points: Annotated[int, Field(ge=0)] = 10_000
+    """Clouds up to this size have one more worker of their own, so that they need not wait for large ones; 0: they
     have none."""
 
     sync_bytes: Annotated[int, Field(ge=0)] = 128 * 1024 * 1024
@@ -120,7 +120,8 @@ class Settings(BaseSettings):
     """One JSON object a line, or text for people."""
 
     traces: bool = False
-    """Send OpenTelemetry traces (OTLP over HTTP) to where OTEL_EXPORTER_OTLP_ENDPOINT says; needs the extra `traces`."""
+    """Send OpenTelemetry traces (OTLP over HTTP) to where OTEL_EXPORTER_OTLP_ENDPOINT says; needs the extra
+    `traces`."""
 
     @field_validator("traces")
     @classmethod

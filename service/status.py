@@ -33,7 +33,7 @@ class JobStatus(BaseModel):
     started: datetime | None
     finished: datetime | None
     expires: datetime | None = Field(description="When a job that ended, and its result, are removed")
-    attempts: int = Field(description="More than one when a process died, or was stopped, that worked on it")
+    attempts: int = Field(description="More than one when a process died that worked on it")
     progress: JobProgress | None
     problem: Problem | None = Field(description="Why the job failed")
     href: str

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import get_args
 
 from prometheus_client import (
     CollectorRegistry,
@@ -18,7 +19,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
 from service.admission import Admission
 from service.exchange import Exchange
-from service.problem_types import TYPES
+from service.problem_types import TYPES, Outcome
 from service.work import Delivery
 from service.worker import Loaded
 
@@ -33,13 +34,25 @@ UNKNOWN_MODEL = "unknown"
 class Telemetry:
     """The metrics of one app, in a registry of its own."""
 
-    def __init__(self, admission: Admission) -> None:
+    def __init__(self, admission: Admission, model: str) -> None:
+        """model: the default one, whose counters are there from the start, so that a rate sees the first event."""
         registry = self.registry = CollectorRegistry()
         ProcessCollector(registry=registry)
         PlatformCollector(registry=registry)
         GCCollector(registry=registry)
         self._requests = Counter(
-            "pointfilter_requests", "Filter requests by how they ended", ["model", "outcome"], registry=registry
+            "pointfilter_requests",
+            "Filter requests by how they ended; of POST /jobs those that were refused",
+            ["model", "outcome"],
+            registry=registry,
+        )
+        self._http = Counter("http_requests", "All requests", ["method", "route", "status"], registry=registry)
+        self._http_seconds = Histogram(
+            "http_request_duration_seconds",
+            "All requests, first byte in to last byte out",
+            ["method", "route"],
+            buckets=(0.005, 0.025, *SECONDS),
+            registry=registry,
         )
         self._request_seconds = Histogram(
             "pointfilter_request_duration_seconds",
@@ -56,7 +69,10 @@ class Telemetry:
             registry=registry,
         )
         self._queue_wait = Histogram(
-            "pointfilter_queue_wait_seconds", "Time waited for a worker", buckets=(0.001, *SECONDS), registry=registry
+            "pointfilter_queue_wait_seconds",
+            "Time that requests and jobs waited for a worker",
+            buckets=(0.001, *SECONDS),
+            registry=registry,
         )
         self._jobs = Counter("pointfilter_jobs", "Jobs by how they ended", ["model", "outcome"], registry=registry)
         self._job_seconds = Histogram(
@@ -88,7 +104,14 @@ class Telemetry:
         running.set_function(lambda: admission.running)
         Gauge("pointfilter_workers", "Workers", registry=registry).set(admission.workers)
         for stage in STAGES:
-            self._stage_seconds.labels(stage)  # there from the start, so that a rate sees the first one
+            self._stage_seconds.labels(stage)
+        for outcome in get_args(Outcome):
+            self._requests.labels(model, outcome)
+            self._jobs.labels(model, outcome)
+
+    def http_ended(self, method: str, route: str, status: int, seconds: float) -> None:
+        self._http.labels(method, route, str(status)).inc()
+        self._http_seconds.labels(method, route).observe(seconds)
 
     def waited(self, seconds: float) -> None:
         self._queue_wait.observe(seconds)

@@ -18,13 +18,17 @@ from starlette.requests import Request
 
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
-from pointfilter.errors import FilteringCancelledError
+from pointfilter.errors import FilteringCancelledError, InputError, LimitExceededError
+from pointfilter.formats.ply_header import read_header
 from pointfilter.limits import ReadLimits
 from pointfilter.models import Auto
 from pointfilter.pipeline import Radius, Report, filter_cloud
 from service.errors import ClientGoneError
 
 T = TypeVar("T")
+
+SMALL_HEADER_BYTES = 1 << 16
+SMALL_ROW_BYTES = 1_000  # more than a row of a scan has, faces included
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,41 @@ def _go_on(stopped: Callable[[], bool]) -> None:
         raise FilteringCancelledError("the work was stopped")
 
 
+def is_small(path: Path, points: int) -> bool:
+    """Whether a file's header promises a cloud of at most so many points, and little else. A damaged one is small: it
+    is refused at once."""
+    size = path.stat().st_size
+    try:
+        with path.open("rb") as file:
+            header = read_header(file, size, ReadLimits(max_header_bytes=SMALL_HEADER_BYTES))
+    except LimitExceededError:
+        return False
+    except InputError:
+        return size <= points * SMALL_ROW_BYTES
+    return header.vertex.count <= points and size <= points * SMALL_ROW_BYTES
+
+
+async def to_the_end(function: Callable[..., T], *arguments: object) -> T:
+    """Calls a function in a thread, and goes on only when it has returned, a cancellation too."""
+    future = asyncio.ensure_future(asyncio.to_thread(function, *arguments))
+    try:
+        return await asyncio.shield(future)
+    except asyncio.CancelledError:
+        await _outwait(future)
+        raise
+
+
+async def _outwait(future: asyncio.Future[T]) -> None:
+    """Waits for a future that nobody can stop, whatever else happens."""
+    while not future.done():
+        try:
+            await asyncio.wait([future])
+        except asyncio.CancelledError:  # a second one must not leave the thread behind
+            continue
+    if not future.cancelled():
+        future.exception()  # looked at, so that asyncio does not complain about it
+
+
 async def in_worker(executor: Executor, work: Callable[[Event], T]) -> T:
     """Runs work(stop) in a thread. Cancelling the waiting task sets `stop`, and the cancellation goes on only when the
     thread has ended: whoever catches it may free the worker and remove the files."""
@@ -104,13 +143,7 @@ async def in_worker(executor: Executor, work: Callable[[Event], T]) -> T:
         return await asyncio.shield(future)
     except asyncio.CancelledError:
         stop.set()
-        while not future.done():
-            try:
-                await asyncio.wait([future])
-            except asyncio.CancelledError:  # a second one must not leave the thread behind
-                continue
-        if not future.cancelled():
-            future.exception()  # looked at, so that asyncio does not complain about it
+        await _outwait(future)
         raise
 
 

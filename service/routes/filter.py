@@ -11,7 +11,7 @@ from starlette.responses import Response
 
 from service.dependencies import AdmittedFolder, CallerDep, ExchangeDep, HouseDep, Ready
 from service.download import FileDownload, content_disposition, result_headers
-from service.errors import DeadlineError, DrainingError
+from service.errors import DeadlineError
 from service.intake import ACCEPTED, JOB_CODES, accept, accepted
 from service.ordering import OrderDep
 from service.problems import answers
@@ -19,7 +19,7 @@ from service.records import Outcome
 from service.settings import variable
 from service.tracing import note_work
 from service.upload import FILE_BODY, receive_upload
-from service.work import cancelled_on_disconnect, in_worker
+from service.work import cancelled_on_disconnect, in_worker, is_small
 
 router = APIRouter()
 
@@ -72,7 +72,7 @@ async def filter_file(
     if upload.size > house.settings.sync_bytes:
         return accepted(request, await accept(request, house, caller, order, upload))
     target = folder / "output.ply"
-    small = upload.size <= house.settings.small_bytes
+    small = await asyncio.to_thread(is_small, upload.path, house.settings.small_points)
     try:
         async with (
             asyncio.timeout(house.settings.timeout_seconds),
@@ -87,14 +87,6 @@ async def filter_file(
             limit=house.settings.timeout_seconds,
             hint="send it as a job (Prefer: respond-async), which has more time, or send less; whoever runs the "
             f"service can raise {variable('timeout_seconds')}",
-        ) from None
-    except asyncio.CancelledError:
-        task = asyncio.current_task()
-        if not house.draining or task is None:
-            raise
-        task.uncancel()  # the server cancels what outlasts the drain; there is just time to say so
-        raise DrainingError(
-            "this process had to end before the result was there; the work was stopped", hint="send the request again"
         ) from None
     house.telemetry.delivered(delivery)
     note_work(delivery)

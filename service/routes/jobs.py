@@ -13,15 +13,16 @@ from starlette.responses import JSONResponse, Response
 
 from service.dependencies import AdmittedPlace, CallerDep, ExchangeDep, HouseDep, Ready
 from service.download import FileDownload, content_disposition, result_headers
-from service.errors import JobCancelledError, JobNotFinishedError
+from service.errors import JobCancelledError, JobNotFinishedError, JobNotFoundError
 from service.house import House
 from service.intake import ACCEPTED, JOB_CODES, accept, accepted
-from service.jobs import Job, not_found
+from service.job import Job, not_found
 from service.ordering import OrderDep
 from service.problems import MEDIA_TYPE, answers
 from service.records import Record, State
 from service.status import JobStatus, described
 from service.upload import FILE_BODY
+from service.work import to_the_end
 
 router = APIRouter(prefix="/jobs", tags=["jobs"], dependencies=[Ready])
 
@@ -92,7 +93,10 @@ async def job_events(request: Request, house: HouseDep, job: JobDep) -> AsyncIte
     is that of GET /jobs/{id}."""
     last = None
     while not house.draining:
-        status = await asyncio.to_thread(_status, request, house, job)
+        try:
+            status = await asyncio.to_thread(_status, request, house, job)
+        except JobNotFoundError:  # removed by now
+            return
         if status != last:
             last = status
             yield ServerSentEvent(event=status.state.value if status.state.final else "progress", data=status)
@@ -125,6 +129,8 @@ async def job_result(house: HouseDep, exchange: ExchangeDep, job: JobDep) -> Res
         raise JobCancelledError("the job was cancelled")
     if record.outcome is None:
         raise JobNotFinishedError(f"the job is {record.state.value}", retry_after=house.runner.retry_after())
+    if not await asyncio.to_thread(job.target.exists):
+        raise not_found()
     return FileDownload(
         job.target,
         record.outcome.size,
@@ -142,16 +148,19 @@ async def job_result(house: HouseDep, exchange: ExchangeDep, job: JobDep) -> Res
     status_code=204,
     responses=answers(*_LOOK_CODES),
 )
-async def end_job(job: JobDep) -> None:
+async def end_job(house: HouseDep, job: JobDep) -> None:
     """The work is stopped when this answers. A job that was cancelled is listed as such until it expires; one that had
     ended is removed, with its result."""
-    if (await asyncio.to_thread(job.read)).state.final:
-        await asyncio.to_thread(job.remove)
+    record = await asyncio.to_thread(job.read)
+    if record.state.final:
+        await to_the_end(house.jobs.remove, job)
         return
     await asyncio.to_thread(job.ask_to_cancel)
     end = time.monotonic() + CANCEL_SECONDS
-    while not await asyncio.to_thread(job.end_if_free) and time.monotonic() < end:
+    while not await to_the_end(job.end_if_free) and time.monotonic() < end:
         await asyncio.sleep(LOOK_SECONDS)
+    if record.state is State.QUEUED and (await asyncio.to_thread(job.read)).started is None:
+        house.telemetry.job_ended(record.order.model, "cancelled", 0.0)  # nobody else will count it
 
 
 def _status(request: Request, house: House, job: Job) -> JobStatus:

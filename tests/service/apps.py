@@ -15,7 +15,7 @@ import service.work
 from pointfilter import PointCloud
 from pointfilter.errors import FilteringCancelledError
 from service import worker
-from service.crew import Hand
+from service.hands import Hand
 from service.house import House
 from service.settings import Settings
 

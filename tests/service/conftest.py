@@ -77,7 +77,7 @@ def make_settings(bundles: Path, temp_dir: Path, data_dir: Path) -> Callable[...
 
     def make(**values: Any) -> Settings:
         given = {"model_dir": bundles, "model": "tiny", "temp_dir": temp_dir, "data_dir": data_dir, "threads": 1}
-        return Settings(**{**given, "small_bytes": 0, **values})
+        return Settings(**{**given, "small_points": 0, **values})
 
     return make
 

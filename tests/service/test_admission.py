@@ -76,6 +76,32 @@ def test_small_ones_have_a_worker_more() -> None:
     asyncio.run(play())
 
 
+def test_one_who_gives_up_in_the_moment_when_a_worker_falls_free() -> None:
+    admission = Admission(workers=1, queue_size=10)
+
+    async def hold(end: asyncio.Event) -> None:
+        async with admission.worker():
+            await end.wait()
+
+    async def play() -> None:
+        end = asyncio.Event()
+        first = asyncio.create_task(hold(end))
+        await asyncio.sleep(0)
+        second, third = (asyncio.create_task(hold(end)) for _ in range(2))
+        await asyncio.sleep(0.01)
+        assert admission.waiting == 2
+        end.set()
+        second.cancel()  # before the first one comes round to giving its worker back
+        await asyncio.gather(first, third)
+        with pytest.raises(asyncio.CancelledError):
+            await second
+        assert (admission.running, admission.waiting) == (0, 0)
+        async with asyncio.timeout(1), admission.worker():
+            pass
+
+    asyncio.run(play())
+
+
 def test_one_who_gives_up_waiting_takes_no_worker() -> None:
     admission = Admission(workers=1, queue_size=5)
 

@@ -20,8 +20,9 @@ from pointfilter import PointCloud
 from pointfilter.errors import FilteringCancelledError, InvalidModelError, MalformedFileError, UnsupportedFormatError
 from service import worker
 from service.app import create_app
-from service.crew import Crew, Hand
+from service.crew import Crew
 from service.errors import WorkerDiedError
+from service.hands import Hand
 from service.settings import Settings
 from service.work import Order
 from tests.service.apps import Gate, house_of, metric, start_thread, until
@@ -224,10 +225,11 @@ def test_without_a_new_worker_the_service_says_so(
 
 
 def test_a_small_cloud_does_not_wait_for_a_large_one(
-    make_client: Callable[..., TestClient], gate: Gate, ply: bytes
+    make_client: Callable[..., TestClient], gate: Gate, ply: bytes, cloud: PointCloud, tmp_path: Path
 ) -> None:
-    client = make_client(workers=1, small_bytes=len(ply))
-    large = ply.replace(b"end_header", b"comment " + b"x" * 100 + b"\nend_header")
+    client = make_client(workers=1, small_points=len(cloud))
+    PointCloud(np.vstack([cloud.xyz, cloud.xyz[:1] + 0.01])).write(tmp_path / "large.ply")
+    large = (tmp_path / "large.ply").read_bytes()
     with ThreadPoolExecutor(3) as pool:
 
         def send(body: bytes) -> Future[Any]:

@@ -13,11 +13,14 @@ import pytest
 from starlette.testclient import TestClient
 
 from service.app import create_app
-from service.jobs import Job, Jobs
-from service.keys import new_key
+from service.errors import UnauthorizedError
+from service.job import Job
+from service.jobs import Jobs
+from service.keys import Keys, KeysError, new_key, read_keys
 from service.records import Record, State
+from service.runner import MOST_ATTEMPTS
 from service.settings import Settings
-from service.work import Order
+from service.work import Order, is_small
 from tests.service.apps import Gate, house_of, metric, until
 from tests.service.test_refusals import check
 
@@ -159,7 +162,7 @@ def test_the_end_of_the_process_loses_no_job(make_settings: Callable[..., Settin
         until(lambda: client.get("/health/ready").status_code == 200)
         statuses = [ended(client, location) for location in jobs]
         assert [status["state"] for status in statuses] == ["done"] * 3
-        assert [status["attempts"] for status in statuses] == [2, 1, 1]
+        assert [status["attempts"] for status in statuses] == [1, 1, 1]  # a stop that was asked for does not count
         results = {client.get(f"{location}/result").content for location in jobs}
         assert results == {client.post("/filter", content=ply).content}
 
@@ -198,13 +201,29 @@ def test_a_full_queue_refuses(make_client: Callable[..., TestClient], gate: Gate
     client = make_client(job_queue_size=2)
     begin(client, ply)
     until(lambda: gate.entered == 1)
-    for _ in range(2):
-        begin(client, ply)
+    last = [begin(client, ply) for _ in range(2)][-1]
     refused = client.post("/jobs", content=ply)
     problem = check(refused, 429, "jobs-full")
     assert (problem["limit"], problem["actual"]) == (2, 3)
     assert int(refused.headers["retry-after"]) >= 1
     assert "POINTFILTER_JOB_QUEUE_SIZE" in str(problem["hint"])
+    assert metric(client, "pointfilter_requests_total", model="tiny", outcome="rejected") == 1
+    assert client.delete(last).status_code == 204  # makes room at once
+    begin(client, ply)
+    gate.open.set()
+
+
+def test_a_cloud_is_small_by_its_points(tmp_path: Path, ply: bytes) -> None:
+    path = tmp_path / "cloud.ply"
+    for content, points, small in (
+        (ply, 500, True),
+        (ply, 499, False),
+        (b"no ply", 1, True),  # refused at once
+        (ply.replace(b"end_header", b"comment " + b"x" * 100_000 + b"\nend_header"), 500, False),
+        (ply + bytes(600_000), 500, False),  # who knows what that is
+    ):
+        path.write_bytes(content)
+        assert is_small(path, points) is small
 
 
 def test_progress_as_it_happens(make_client: Callable[..., TestClient], gate: Gate, ply: bytes) -> None:
@@ -235,6 +254,19 @@ def parsed(lines: Iterator[str]) -> Iterator[tuple[str, dict[str, Any]]]:
             name = line.removeprefix("event: ")
         if line.startswith("data: "):
             yield name, json.loads(line.removeprefix("data: "))
+
+
+def test_a_job_that_ends_every_process_is_given_up(client: TestClient, gate: Gate, ply: bytes, data_dir: Path) -> None:
+    begin(client, ply)
+    until(lambda: gate.entered == 1)
+    jobs = Jobs(data_dir)
+    poison = accepted(jobs)
+    poison.source.write_bytes(ply)
+    poison.write(poison.read().model_copy(update={"attempts": MOST_ATTEMPTS, "state": State.RUNNING}))
+    gate.open.set()
+    found = ended(client, f"/jobs/{poison.id}")
+    assert (found["state"], found["problem"]["code"]) == ("failed", "worker-died")
+    assert gate.entered == 1
 
 
 def test_jobs_that_ended_go_after_a_while(client: TestClient, ply: bytes, data_dir: Path) -> None:
@@ -277,6 +309,28 @@ def test_without_a_key_nothing_is_filtered(make_client: Callable[..., TestClient
         assert client.get("/health/ready").status_code == 200
 
 
+def test_keys_come_and_go_with_the_file(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.keys.LOOK_SECONDS", 0.0)
+    path = tmp_path / "keys"
+    (old, old_line), (new, new_line) = new_key("ann"), new_key("ann")
+    path.write_text(old_line)
+    keys = Keys(path)
+    assert keys.caller(f"Bearer {old}") == "ann"
+    path.write_text(f"{old_line}\n{new_line}")
+    assert keys.caller(f"bearer {new}") == keys.caller(f"Bearer {old}") == "ann"
+    path.write_text(f"{new_line}\nwhat is this")
+    assert keys.caller(f"Bearer {old}") == "ann"
+    assert "line 2" in caplog.text  # whoever wanted the old key gone must know that it is not
+    path.write_text(f"{new_line}\n")
+    with pytest.raises(UnauthorizedError):
+        keys.caller(f"Bearer {old}")
+    path.write_text("ann x")
+    with pytest.raises(KeysError, match="line 1"):
+        read_keys(path)
+
+
 def test_jobs_are_their_owner_s(make_client: Callable[..., TestClient], tmp_path: Path, ply: bytes) -> None:
     with keyed(make_client, tmp_path) as (client, headers):
         location = begin(client, ply, headers=headers["ann"])
@@ -316,7 +370,7 @@ def test_first_in_first_out_and_small_ones_by_themselves(data_dir: Path) -> None
     jobs = Jobs(data_dir)
     large = [accepted(jobs).id for _ in range(3)]
     small = [accepted(jobs, small=True).id for _ in range(2)]
-    assert (jobs.queued(False), jobs.queued(True), jobs.queued()) == (3, 2, 5)
+    assert (jobs.queued(False), jobs.queued(True), jobs.waiting()) == (3, 2, 5)
     again = Jobs(data_dir)  # another process
     assert [job.id for job in (again.next(False), jobs.next(False), again.next(False)) if job] == large
     assert [job.id for job in (again.next(True), again.next(True)) if job] == small

@@ -25,6 +25,8 @@ NAMES = {
     "pointfilter_points": "counter",
     "pointfilter_points_per_request": "histogram",
     "pointfilter_model_info": "gauge",
+    "http_requests": "counter",
+    "http_request_duration_seconds": "histogram",
     "pointfilter_jobs": "counter",
     "pointfilter_job_duration_seconds": "histogram",
     "pointfilter_jobs_waiting": "gauge",
