@@ -20,6 +20,8 @@ TYPES = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 
+MOST_ELEMENTS = 1_000
+
 
 @dataclass(frozen=True)
 class Property:
@@ -156,6 +158,13 @@ class _Parser:
             )
         if words[0] in self.elements:
             raise MalformedFileError(f"line {number}: a second element {shown(words[0])}")
+        if len(self.elements) >= MOST_ELEMENTS:
+            raise LimitExceededError(
+                f"line {number}: more than {MOST_ELEMENTS} elements",
+                limit=MOST_ELEMENTS,
+                actual=MOST_ELEMENTS + 1,
+                hint="real files have a handful: is this a PLY file?",
+            )
         self.properties = {}
         self.elements[words[0]] = (int(words[1]), self.properties)
 

@@ -80,7 +80,8 @@ attack(
     header("element vertex 9", *(f"property char p{k}" for k in range(40_000))),
     Missing,
 )
-attack("tens of thousands of elements", header(*(f"element e{k} 0" for k in range(60_000))), Missing)
+attack("a thousand elements", header(*(f"element e{k} 0" for k in range(1_000))), Missing)
+attack("tens of thousands of elements", header(*(f"element e{k} 0" for k in range(60_000))), Limit)
 attack("no end", GOOD.split(b"end_header")[0], Malformed)
 attack("an end without a line break", header(*("element vertex 0", *XYZ))[:-1], Malformed)
 attack("no format", b"ply\nelement vertex 1\n", Malformed)
