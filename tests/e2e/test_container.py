@@ -173,10 +173,11 @@ def test_a_killed_worker_is_replaced(stack: tuple[Server, Server, str]) -> None:
     assert server.get("/health/live").status == 200
 
 
-def test_the_image_is_not_large(image: str) -> None:
+def test_the_image_is_not_large(image: str, capsys: pytest.CaptureFixture[str]) -> None:
     base = os.environ.get("POINTFILTER_TEST_PYTHON_IMAGE", "python:3.11-slim")
     size, under = (int(run("docker", "image", "inspect", "--format", "{{.Size}}", name)) for name in (image, base))
-    print(f"image: {size / 1e6:.0f} MB, {(size - under) / 1e6:.0f} MB above its base")
+    with capsys.disabled():
+        print(f"\nimage: {size / 1e6:.0f} MB, {(size - under) / 1e6:.0f} MB above its base")
     assert size - under <= 550e6
 
 
