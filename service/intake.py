@@ -67,22 +67,22 @@ def accepted(request: Request, record: Record) -> Response:
 def _check_room(house: House, caller: str | None) -> None:
     """Raises JobsFullError."""
     settings = house.settings
-    waiting = house.jobs.waiting()
-    if waiting >= settings.job_queue_size:
-        raise JobsFullError(
-            f"{waiting} jobs are waiting, as many as this service keeps",
-            limit=settings.job_queue_size,
-            actual=waiting + 1,
-            hint=f"try again later; whoever runs the service can raise {variable('job_queue_size')}",
-            retry_after=house.runner.retry_after(),
-        )
+
+    def check(count: int, limit: int, told: str, hint: str) -> None:
+        if count >= limit:
+            retry_after = house.runner.retry_after()
+            raise JobsFullError(f"{count} {told}", limit=limit, actual=count + 1, hint=hint, retry_after=retry_after)
+
+    check(
+        house.jobs.waiting(),
+        settings.job_queue_size,
+        "jobs are waiting, as many as this service keeps",
+        f"try again later; whoever runs the service can raise {variable('job_queue_size')}",
+    )
     if settings.jobs_per_key and caller is not None:
-        unfinished = house.jobs.unfinished(caller)
-        if unfinished >= settings.jobs_per_key:
-            raise JobsFullError(
-                f"{unfinished} jobs of this API key are not finished, as many as it may have",
-                limit=settings.jobs_per_key,
-                actual=unfinished + 1,
-                hint=f"whoever runs the service can raise {variable('jobs_per_key')}",
-                retry_after=house.runner.retry_after(),
-            )
+        check(
+            house.jobs.unfinished(caller),
+            settings.jobs_per_key,
+            "jobs of this API key are not finished, as many as it may have",
+            f"whoever runs the service can raise {variable('jobs_per_key')}",
+        )

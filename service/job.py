@@ -92,22 +92,20 @@ class Job:
             record = self.read()
             if free and not record.state.final:
                 record = record.model_copy(update={"state": State.CANCELLED, "finished": time.time()})
-                self.write(record)
-                self.tidy()
+                self.conclude(record)
             return record.state.final
 
-    def tidy(self) -> None:
-        """Removes what a job that ended needs no longer, and what a worker left that was killed while writing."""
-        kept = {"job.json", "lock", "progress.json"} | ({"output.ply"} if self.read().state is State.DONE else set())
-        for path in self.folder.iterdir():
-            if path.name not in kept:
-                path.unlink(missing_ok=True)
-
     def conclude(self, record: Record) -> None:
-        """The record first: a job whose files are gone would be a lost one."""
-        with suppress(FileNotFoundError, JobNotFoundError):  # removed meanwhile
+        """Writes down how the job ended, and removes what it needs no longer and what a killed worker left.
+
+        The record first: a job whose files are gone would be a lost one.
+        """
+        kept = {"job.json", "lock", "progress.json"} | ({"output.ply"} if record.state is State.DONE else set())
+        with suppress(FileNotFoundError):  # removed meanwhile
             self.write(record)
-            self.tidy()
+            for path in self.folder.iterdir():
+                if path.name not in kept:
+                    path.unlink(missing_ok=True)
 
     def remove(self) -> None:
         shutil.rmtree(self.folder, ignore_errors=True)

@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 
 from pointfilter import PointCloud
+from tests.e2e.conftest import free_port
 from tests.service.apps import until
 
 ROOT = Path(__file__).parents[2]
@@ -151,8 +152,7 @@ def test_replicas_share_the_jobs_through_redis(
 ) -> None:
     if not shutil.which("redis-server"):
         pytest.skip("no redis-server on this machine (Debian: apt-get install redis-server)")
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = free_port()
     command = ["redis-server", "--port", str(port), "--save", "", "--dir", str(tmp_path)]
     redis = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:
