@@ -578,6 +578,49 @@ PyObject* build_patches(PyObject*, PyObject* args) {
   Py_RETURN_NONE;
 }
 
+PyObject* mean_vectors(PyObject*, PyObject* args) {
+  PyObject *index_object, *vectors_object, *means_object, *squares_object, *counts_object;
+  double radius;
+  Py_ssize_t first, enough;
+  if (!PyArg_ParseTuple(args, "OOndnOOO", &index_object, &vectors_object, &first, &radius, &enough, &means_object,
+                        &squares_object, &counts_object))
+    return nullptr;
+  IndexBuffers held;
+  Buffer vectors, means, squares, counts;
+  if (!held.take(index_object) || !vectors.take(vectors_object, 8, false, "vectors") ||
+      !means.take(means_object, 8, true, "means") || !squares.take(squares_object, 8, true, "squares") ||
+      !counts.take(counts_object, 8, true, "counts"))
+    return nullptr;
+  const Index& index = held.index;
+  const Py_ssize_t n = counts.items();
+  if (!expect(vectors, 3 * static_cast<Py_ssize_t>(index.points), "vectors") || !expect(means, 3 * n, "means") ||
+      !expect(squares, n, "squares"))
+    return nullptr;
+  if (first < 0 || first > static_cast<Py_ssize_t>(index.points) - n) {
+    PyErr_SetString(PyExc_ValueError, "positions beyond the index");
+    return nullptr;
+  }
+  Neighbourhood neighbourhood(index, radius);
+  const double* all = vectors.data<double>();
+  const bool done = for_each(n, [&](Py_ssize_t i) {
+    const Py_ssize_t at = first + i;
+    const double centre[3] = {index.x[at], index.y[at], index.z[at]};
+    double sum[3] = {}, square = 0;
+    const std::vector<int64_t>& members =
+        neighbourhood.around(centre, static_cast<size_t>(std::max<Py_ssize_t>(enough, 1)));
+    for (const int64_t j : members) {
+      const double* vector = all + 3 * j;
+      for (int k = 0; k < 3; ++k) sum[k] += vector[k], square += vector[k] * vector[k];
+    }
+    const double count = static_cast<double>(std::max<size_t>(members.size(), 1));
+    for (int k = 0; k < 3; ++k) means.data<double>()[3 * i + k] = sum[k] / count;
+    squares.data<double>()[i] = square / count;
+    counts.data<int64_t>()[i] = static_cast<int64_t>(members.size());
+  });
+  if (!done) return nullptr;
+  Py_RETURN_NONE;
+}
+
 PyMethodDef methods[] = {
     {"count_neighbours", count_neighbours, METH_VARARGS,
      "count_neighbours(index, centres (q, 3) f8, radius, enough, counts (q,) i8 out)"},
@@ -587,6 +630,9 @@ PyMethodDef methods[] = {
     {"build_patches", build_patches, METH_VARARGS,
      "build_patches(index, centres (q, 3) f8, centre_ids (q,) u8, radius, key, patches (q, N, 3) f4 out, "
      "frames (q, 3, 3) f8 out, counts (q,) i8 out)"},
+    {"mean_vectors", mean_vectors, METH_VARARGS,
+     "mean_vectors(index, vectors (n, 3) f8, first, radius, enough, means (q, 3) f8 out, squares (q,) f8 out, "
+     "counts (q,) i8 out)"},
     {nullptr, nullptr, 0, nullptr}};
 
 PyModuleDef module = {PyModuleDef_HEAD_INIT, "_native", "Compiled part of pointfilter.patches.", 0, methods,

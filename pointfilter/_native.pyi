@@ -28,3 +28,14 @@ def build_patches(
     counts: NDArray[Any],
     /,
 ) -> None: ...
+def mean_vectors(
+    index: Index,
+    vectors: NDArray[Any],
+    first: int,
+    radius: float,
+    enough: int,
+    means: NDArray[Any],
+    squares: NDArray[Any],
+    counts: NDArray[Any],
+    /,
+) -> None: ...

@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from pointfilter.drift import without_drift
 from pointfilter.errors import (
     DegenerateCloudError,
     FilteringCancelledError,
@@ -46,21 +47,23 @@ PASSES = ((0.0035, 0), (0.1, 2), (0.2, 3))
 docs/adr/0007-automatic-iterations.md has the measurements."""
 ARRIVED = 0.02  # of the radius: after the second pass, a point whose step was shorter stays where it is
 MOST_PASSES = 4  # above all of them
+DRIFT_FROM = 3  # passes: so many take more than noise away, and their drift is given back
 CENTRES_PER_COUNT = 1024  # centres whose neighbours are counted between two looks at `cancelled`
 
 
 @dataclass
 class Timings:
-    """Seconds spent, by stage, and passes done. `patches` and `infer` are summed over the workers."""
+    """Seconds spent, by stage, and passes done. `patches` and `infer` are summed over the threads."""
 
     passes: int = 0
     index: float = 0.0
     patches: float = 0.0
     infer: float = 0.0
+    drift: float = 0.0
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def as_dict(self) -> dict[str, float]:
-        return {"index": self.index, "patches": self.patches, "infer": self.infer}
+        return {"index": self.index, "patches": self.patches, "infer": self.infer, "drift": self.drift}
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
@@ -122,11 +125,12 @@ def filter_points(
 
     radius: absolute, in the unit of the points; by default 5 % of the bounding-box diagonal. It is taken once, from the
     input, and kept for all iterations. iterations: a number, or "auto" for as many as the cloud needs (PASSES); a clean
-    one comes back as it was. A point that has ARRIVED stays where it is in later ones. patch_points: N, what the
-    network was trained with. seed: of the downsampling. threads: how many batches are evaluated at once; the result
-    does not depend on it. progress(done, total) is called from this thread, in units of points times iterations, from 0
-    on. cancelled() is asked between batches, from any thread. after_pass(passes, points) sees the cloud as it is after
-    every pass.
+    one comes back as it was. A point that has ARRIVED stays where it is in later ones; what DRIFT_FROM and more of them
+    take away on average is given back at the end (drift.py). patch_points: N, what the network was trained with. seed:
+    of the downsampling. threads: how many batches are evaluated at once; the result does not depend on it.
+    progress(done, total) is called from this thread, in units of points times iterations, from 0 on. cancelled() is
+    asked between batches, from any thread. after_pass(passes, points) sees after every pass what the result of so many
+    iterations is.
 
     Raises TooFewPointsError, DegenerateCloudError, ParameterError, FilteringCancelledError.
     """
@@ -154,7 +158,7 @@ def filter_points(
     timings = timings or Timings()
     low, high = points.min(axis=0), points.max(axis=0)
     offset = low + (high - low) / 2  # large coordinates must not cost digits
-    moved = points - offset
+    moved = original = points - offset
     ids = stable_ids(moved)
     with timings.measure("index"):
         index = NeighbourIndex(moved, absolute_radius, ids)
@@ -166,6 +170,17 @@ def filter_points(
             return points.copy()
     else:
         passes = iterations
+
+    def check() -> None:
+        if cancelled is not None and cancelled():
+            raise FilteringCancelledError("filtering was cancelled")
+
+    def result(done: int) -> Float64:
+        if done < DRIFT_FROM:
+            return np.asarray(moved + offset)
+        with timings.measure("drift"):
+            return np.asarray(without_drift(moved, original, ids, absolute_radius, threads, check) + offset)
+
     moving = np.ones(len(points), dtype=bool)
     for iteration in range(passes):
         if iteration and moving.any():
@@ -180,13 +195,13 @@ def filter_points(
 
         report(0)
         before, key = moved, sampling_key(seed, iteration)
-        moved = _one_pass(before, moving, ids, index, predict, patch_points, key, threads, report, cancelled, timings)
+        moved = _one_pass(before, moving, ids, index, predict, patch_points, key, threads, report, check, timings)
         if iteration:  # the second step is the first one that sees cleaned neighbours
             moving &= np.linalg.norm(moved - before, axis=1) >= ARRIVED * absolute_radius
         timings.passes += 1
         if after_pass is not None:
-            after_pass(timings.passes, moved + offset)
-    return np.asarray(moved + offset)
+            after_pass(timings.passes, result(timings.passes))
+    return result(passes)
 
 
 def expected_displacement(
@@ -219,17 +234,13 @@ def _one_pass(
     key: int,
     threads: int,
     report: Callable[[int], None],
-    cancelled: Callable[[], bool] | None,
+    check: Callable[[], None],
     timings: Timings,
 ) -> Float64:
     """Eq. 8 once for every point that is `moving` (n,). Each point's answer depends on its own patch alone."""
     rows = index.order[moving[index.order]]  # in this order neighbours in space are neighbours in memory
     centres, centre_ids = points[rows], ids[rows]
     result = points.copy()
-
-    def check() -> None:
-        if cancelled is not None and cancelled():
-            raise FilteringCancelledError("filtering was cancelled")
 
     def evaluate(chosen: NDArray[np.int64], length: int) -> int:
         with timings.measure("patches"):

@@ -111,6 +111,19 @@ class NeighbourIndex:
         )
         return Patches(points, frames, counts)
 
+    def averages(self, vectors: Float64, first: int, last: int, enough: int) -> tuple[Float64, Float64, Int64]:
+        """Means over the balls around the points at the positions first to last (exclusive) of `order`.
+
+        vectors: (n, 3) float64, one a point, C-contiguous and in the order of `order`. Of a ball that holds many more
+        than `enough` points a share is looked at, as for a patch.
+        Returns the mean vector (q, 3) and the mean of the squared lengths (q,), float64, and how many points it was of
+        (q,), int64.
+        """
+        count = last - first
+        means, squares, counts = np.empty((count, 3)), np.empty(count), np.empty(count, dtype=np.int64)
+        _native.mean_vectors(self._arrays, vectors, first, self.radius, enough, means, squares, counts)
+        return means, squares, counts
+
 
 def _mixed(ids: UInt64) -> UInt64:
     """The native code's mix(id): Stafford's variant 13 of the MurmurHash3 finaliser."""

@@ -83,7 +83,7 @@ def carry_out(
         progress=lambda done, total: progress(done, total, points),
         cancelled=stopped,
     )
-    seconds.update({stage: report.seconds[stage] for stage in ("index", "patches", "infer")})
+    seconds.update({stage: report.seconds[stage] for stage in ("index", "patches", "infer", "drift")})
     _go_on(stopped)
     started = time.perf_counter()
     filtered.write(target, order.encoding, report.comment)

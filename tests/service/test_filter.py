@@ -79,7 +79,7 @@ def test_headers_say_what_was_done(client: TestClient, ply: bytes) -> None:
     assert answer.headers["x-model"] == "tiny"
     assert answer.headers["x-points"] == "500"
     stages = re.findall(r"(\w+);dur=\d+\.\d", answer.headers["server-timing"])
-    assert stages == ["queue", "parse", "index", "patches", "infer", "write"]
+    assert stages == ["queue", "parse", "index", "patches", "infer", "drift", "write"]
 
 
 def test_another_model_is_loaded_when_asked_for(client: TestClient, ply: bytes) -> None:

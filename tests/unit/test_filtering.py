@@ -143,8 +143,11 @@ def test_automatic_iterations_follow_the_displacement(noisy_crease: np.ndarray) 
     assert done[0] == 0
 
 
-def test_points_that_have_arrived_stay_and_cost_nothing(noisy_crease: np.ndarray) -> None:
+def test_points_that_have_arrived_stay_and_cost_nothing(
+    noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Steps shrink to a tenth from pass to pass; some points arrive in the second, the others in the third."""
+    monkeypatch.setattr(filtering, "DRIFT_FROM", 99)  # steps alone
     radius, count = 0.15, len(noisy_crease)
     evaluated: list[int] = []
     seen: list[np.ndarray] = [noisy_crease]
@@ -365,7 +368,7 @@ def test_timings_are_added_up_by_stage(noisy_crease: np.ndarray) -> None:
 
     timings = Timings()
     filter_points(noisy_crease, slow, iterations=2, timings=timings)
-    assert set(timings.as_dict()) == {"index", "patches", "infer"}
+    assert set(timings.as_dict()) == {"index", "patches", "infer", "drift"}
     assert timings.infer >= 0.02
     assert timings.index > 0
     assert timings.patches > 0

@@ -52,7 +52,7 @@ def test_the_report_says_what_was_done(engine: Engine, noisy_crease: np.ndarray)
     assert report.largest_displacement == pytest.approx(moved.max())
     assert (report.points, report.skipped, report.iterations, report.radius, report.seed) == (600, 0, 1, 0.2, 9)
     assert (report.model, report.model_sha256) == (engine.bundle.name, engine.bundle.sha256)
-    assert report.seconds.keys() == {"index", "patches", "infer", "total"}
+    assert report.seconds.keys() == {"index", "patches", "infer", "drift", "total"}
     json.dumps(report.as_dict())
     for fact in (report.model, report.model_version, report.model_sha256[:16], "iterations 1", "radius 0.2", "seed 9"):
         assert fact in report.comment
