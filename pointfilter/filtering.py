@@ -41,7 +41,7 @@ MIN_NEIGHBOURS = 4  # fewer, the centre included, say nothing about a surface: t
 ROWS_PER_BATCH = 2_048  # points a batch, all its patches together; measured: docs/adr/0005-one-thread-a-call.md
 BATCHES_PER_TASK = 8  # batches that a worker cuts in one go, so that workers seldom meet at the interpreter's lock
 SAMPLE_POINTS = 2_048  # points by which "auto" judges a cloud: the standard error stays below two hundredths
-PASSES = ((0.0035, 0), (0.1, 2), (0.2, 3))
+PASSES = ((0.007, 0), (0.1, 2), (0.2, 3))
 """What "auto" does: (mean displacement of one pass, in units of the radius; passes over a cloud that stays below it).
 
 docs/adr/0007-automatic-iterations.md has the measurements."""
