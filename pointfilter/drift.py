@@ -9,12 +9,12 @@ is given back as the scatter in the region cannot explain (a shrinkage estimate:
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pointfilter.patches import NeighbourIndex
+from pointfilter.ranges import over_ranges
 
 Float64 = NDArray[np.float64]
 
@@ -43,19 +43,12 @@ def without_drift(
     for window in WINDOWS:
         index = NeighbourIndex(moved, window * radius, ids)
         lost = np.ascontiguousarray((original - moved)[index.order])
-        starts = range(0, len(moved), POINTS_PER_TASK)
 
-        def drift(first: int, index: NeighbourIndex = index, lost: Float64 = lost) -> Float64:
-            last = min(first + POINTS_PER_TASK, len(lost))
+        def drift(first: int, last: int, index: NeighbourIndex = index, lost: Float64 = lost) -> Float64:
             return _significant(*index.averages(lost, first, last, ENOUGH))
 
-        parts = [np.empty((0, 3))]
-        with ThreadPoolExecutor(threads, thread_name_prefix="drift") as pool:
-            for group in range(0, len(starts), threads):
-                parts += pool.map(drift, starts[group : group + threads])
-                check()
         back = np.empty_like(moved)
-        back[index.order] = np.concatenate(parts)
+        back[index.order] = np.concatenate(over_ranges(drift, len(moved), POINTS_PER_TASK, threads, check))
         moved = np.where(movable[:, None], moved + back, moved)
     return moved
 

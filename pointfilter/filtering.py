@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +26,7 @@ from pointfilter.errors import (
 from pointfilter.models import Auto
 from pointfilter.noise import bounding_box_diagonal
 from pointfilter.patches import NeighbourIndex, Patches, length_buckets, sampling_key, stable_ids
+from pointfilter.ranges import over_ranges
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -199,9 +199,12 @@ def filter_points(
         if iteration:  # the second step is the first one that sees cleaned neighbours
             moving &= np.linalg.norm(moved - before, axis=1) >= ARRIVED * absolute_radius
         timings.passes += 1
-        if after_pass is not None:
-            after_pass(timings.passes, result(timings.passes))
-    return result(passes)
+        if after_pass is not None and iteration + 1 < passes:
+            after_pass(iteration + 1, result(iteration + 1))
+    filtered = result(passes)
+    if after_pass is not None:
+        after_pass(passes, filtered)
+    return filtered
 
 
 def expected_displacement(
@@ -310,11 +313,9 @@ def _count(
     index: NeighbourIndex, centres: Float64, enough: int, threads: int, check: Callable[[], None]
 ) -> NDArray[np.int64]:
     """Neighbours of every centre, up to `enough`. Can be cancelled."""
-    counts = [np.empty(0, dtype=np.int64)]
-    with ThreadPoolExecutor(threads, thread_name_prefix="count") as pool:
-        starts = range(0, len(centres), CENTRES_PER_COUNT)
-        for first in range(0, len(starts), threads):
-            parts = [centres[start : start + CENTRES_PER_COUNT] for start in starts[first : first + threads]]
-            counts += pool.map(partial(index.count, enough=enough), parts)
-            check()
-    return np.concatenate(counts)
+
+    def count(first: int, last: int) -> NDArray[np.int64]:
+        return index.count(centres[first:last], enough=enough)
+
+    counts = over_ranges(count, len(centres), CENTRES_PER_COUNT, threads, check)
+    return np.concatenate([np.empty(0, dtype=np.int64), *counts])
