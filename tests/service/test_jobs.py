@@ -58,7 +58,7 @@ def test_a_job_gives_what_a_request_gives(client: TestClient, ply: bytes, data_d
     assert result.headers["server-timing"].startswith("queue;dur=")
     (folder,) = (data_dir / "jobs").iterdir()
     assert not (folder / "input.ply").exists()  # not kept longer than it is needed
-    assert metric(client, "pointfilter_jobs_total", model="tiny", outcome="ok") == 1
+    until(lambda: metric(client, "pointfilter_jobs_total", model="tiny", outcome="ok") == 1)  # counted once it is told
     assert metric(client, "pointfilter_points_total", model="tiny") == 1000
 
 
@@ -148,7 +148,7 @@ def test_a_job_that_takes_too_long_is_stopped(make_client: Callable[..., TestCli
     assert (found["state"], found["problem"]["code"]) == ("failed", "deadline-exceeded")
     assert "POINTFILTER_JOB_SECONDS" in found["problem"]["hint"]
     assert gate.stopped == 1
-    assert metric(client, "pointfilter_jobs_total", model="tiny", outcome="timeout") == 1
+    until(lambda: metric(client, "pointfilter_jobs_total", model="tiny", outcome="timeout") == 1)
 
 
 def test_the_end_of_the_process_loses_no_job(make_settings: Callable[..., Settings], gate: Gate, ply: bytes) -> None:
