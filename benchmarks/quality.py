@@ -9,7 +9,7 @@ DIR holds paper4/ (clean clouds NAME.npy, noisy copies NAME_0.005.npy, surfaces 
 be missing. The data is not part of this repository: --data or POINTFILTER_BENCHMARK_DATA says where it lies.
 
 Rows: noisy; limit, the exact projection of the noisy points onto the surface; every bundle after 1, 2, 4 and auto
-iterations; the classics (classics.py), each tuned on the paper's clouds for the noise at hand. Columns: subjects.py.
+iterations; the classics (classics/), each tuned on the paper's clouds for the noise at hand. Columns: subjects.py.
 CD ×1e5, P2F ×1e3, both for a clean cloud scaled to a diagonal of 1 (§4.3); edge: P2F close to sharp edges.
 """
 
@@ -83,7 +83,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--models", nargs="*", default=list(available_models()), help="names or folders of bundles")
     parser.add_argument("--classics", nargs="*", default=list(classics.available()), help="default: all that are there")
     parser.add_argument(
-        "--columns", nargs="+", default=columns, choices=columns, metavar="NAME", help=", ".join(columns)
+        "--columns",
+        nargs="+",
+        default=columns,
+        choices=columns,
+        metavar="NAME",
+        help=", ".join(columns).replace("%", "%%"),
     )
     parser.add_argument(
         "--patch-points",

@@ -29,8 +29,6 @@ import itertools
 import json
 import multiprocessing
 import os
-import platform
-import resource
 import socket
 import subprocess
 import sys
@@ -44,12 +42,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from benchmarks import classics
+from benchmarks.rates import machine, patch_flops, peak_memory, rate, sgemm, stolen_seconds
+from benchmarks.speed_report import CLASSIC_POINTS, ITERATIONS, Figures, compared, line, ratios
 from benchmarks.subjects import Column, Subject, sample_mesh
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine, available_cpus
@@ -59,20 +58,14 @@ from pointfilter.noise import bounding_box_diagonal
 from pointfilter.patches import NeighbourIndex, stable_ids
 from pointfilter.pipeline import filter_cloud
 
-Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
-Figures = dict[str, Any]
 
 NOISE = 0.005
 COLUMN = Column("speed", NOISE)
-ITERATIONS = 2
 PAPER = {"encoder": [64, 128, 256, 512, 1024], "decoder": [512, 256]}
 PAPER_POINTS = 500
 NAIVE_SAMPLE = 1024  # points that the naive pipeline is timed on
 NAIVE_BATCH = 64
-CLASSIC_POINTS = 100_000
-SECONDS = 3.0  # how long a rate is measured
-SGEMM_SIZES = (256, 512, 1024, 2048)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -82,10 +75,10 @@ def main(arguments: list[str] | None = None) -> int:
     for what, values in _plan(options):
         row = _alone(what, **values)
         table.append(row)
-        print(_line(row), flush=True)
+        print(line(row), flush=True)
     result = {"machine": machine(), "rows": table}
-    for line in [*_ratios(table), *(_compared(result, against) if against else [])]:
-        print(line)
+    for said in [*ratios(table), *(compared(result, against) if against else [])]:
+        print(said)
     if options.json:
         options.json.write_text(json.dumps(result, indent=1) + "\n")
     return 0
@@ -142,9 +135,6 @@ def _alone(measure: Callable[..., Figures], **values: Any) -> Figures:
     return {"what": measure.__name__, **values, **figures, "stolen": (stolen_seconds() - stolen) / cpu_seconds}
 
 
-# What is measured --------------------------------------------------------------------------------------------------
-
-
 def network(model: str, device: str, threads: int) -> Figures:
     """Patches a second of the network alone, in batches as the filter makes them, one thread a batch."""
     bundle = open_model(model)
@@ -157,7 +147,7 @@ def network(model: str, device: str, threads: int) -> Figures:
         for start in range(0, 64 * size, size)
     ]
     batches = [batch for batch in batches if len(batch) == size]
-    calls = _rate(lambda number: engine(batches[number % len(batches)]), threads)
+    calls = rate(lambda number: engine(batches[number % len(batches)]), threads)
     gflops = calls * size * patch_flops(bundle.network, bundle.patch_points) / 1e9
     best = sgemm(threads)
     return {
@@ -317,9 +307,6 @@ def classic(method: str) -> Figures:
     return {"points": CLASSIC_POINTS, "seconds": seconds, "cd": scores["cd"], "p2f": scores["p2f"]}
 
 
-# How it is measured ------------------------------------------------------------------------------------------------
-
-
 def ring(points: int) -> Subject:
     """A ring with a square profile and so many points: flat and curved faces that meet in right angles."""
     mesh = trimesh.creation.annulus(r_min=0.3, r_max=0.5, height=0.3, sections=512)
@@ -333,176 +320,6 @@ def _indexed(points: Float64, fraction: float) -> tuple[NeighbourIndex, NDArray[
 
 def _widths(network: Figures) -> str:
     return "-".join(map(str, [*network["encoder"], *network["decoder"]]))
-
-
-def patch_flops(widths: Figures, points: int) -> float:
-    """Multiplications and additions of the network's products for one patch."""
-    encoder = [3, *widths["encoder"]]
-    decoder = [encoder[-1], *widths["decoder"], 3]
-
-    def products(layers: list[int]) -> int:
-        return sum(a * b for a, b in itertools.pairwise(layers))
-
-    return 2.0 * (points * products(encoder) + products(decoder))
-
-
-def sgemm(threads: int) -> float:
-    """GFLOP/s of NumPy's best float32 product, one in every thread at once."""
-    best = 0.0
-    for size in SGEMM_SIZES:
-        matrices = np.random.default_rng(0).random((threads, size, size), np.float32)
-        products = np.empty_like(matrices)
-
-        def multiply(number: int, matrices: Float32 = matrices, products: Float32 = products) -> None:
-            matrix = matrices[number % threads]
-            np.matmul(matrix, matrix, out=products[number % threads])
-
-        best = max(best, _rate(multiply, threads, SECONDS / len(SGEMM_SIZES)) * 2 * size**3 / 1e9)
-    return best
-
-
-def _rate(call: Callable[[int], object], threads: int, seconds: float = SECONDS) -> float:
-    """Calls a second, `threads` of them at a time, each thread with numbers of its own."""
-
-    def work(first: int, until: float) -> int:
-        done = 0
-        while time.perf_counter() < until:
-            call(first + done * threads)
-            done += 1
-        return done
-
-    with ThreadPoolExecutor(threads) as pool:
-        for duration in (0.2, seconds):  # the first round warms up
-            started = time.perf_counter()
-            counts = [pool.submit(work, number, started + duration) for number in range(threads)]
-            done = sum(count.result() for count in counts)
-            elapsed = time.perf_counter() - started
-    return done / elapsed
-
-
-def peak_memory() -> float:
-    """The most memory that this process has held so far, in bytes. ru_maxrss would know the parent's too."""
-    try:
-        status = Path("/proc/self/status").read_text()
-        return 1024.0 * int(status.partition("VmHWM:")[2].split()[0])
-    except (OSError, IndexError):
-        return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
-def stolen_seconds() -> float:
-    """CPU seconds that a virtual machine wanted and its host gave to others, since it was started."""
-    try:
-        return int(Path("/proc/stat").read_text().split()[8]) / os.sysconf("SC_CLK_TCK")
-    except (OSError, IndexError, ValueError):
-        return 0.0
-
-
-def machine() -> Figures:
-    """What the figures were measured on."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        processor = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        processor = platform.processor()
-    return {
-        "processor": processor,
-        "cpus": available_cpus(),
-        "python": platform.python_version(),
-        "onnxruntime": onnxruntime.__version__,
-        "numpy": np.__version__,
-    }
-
-
-# What is said about it ---------------------------------------------------------------------------------------------
-
-
-def _name(row: Figures) -> str:
-    name = row.get("method") or row.get("model") or "paper's network"
-    return f"{row['what']:11}{name:28}{row.get('device', ''):9}" + (
-        f"{row['threads']} threads  " if "threads" in row else " " * 11
-    )
-
-
-def _line(row: Figures) -> str:
-    if row["what"] == "network":
-        figures = (
-            f"{row['patches_per_second']:8.0f} patches/s of {row['patch_points']} points, {row['gflops']:6.1f} GFLOP/s,"
-            f" {row['share']:.0%} of sgemm's {row['sgemm_gflops']:.1f}"
-        )
-    elif row["what"] == "end_to_end":
-        stages = ", ".join(f"{name} {row[name]:.2f}" for name in ("read", "index", "patches", "network", "write"))
-        figures = (
-            f"{row['points']:8d} points × {ITERATIONS}: {row['seconds']:7.2f} s ({stages}); not the network "
-            f"{row['not_network']:.0%}; peak {row['peak_mb']:.0f} MB"
-        )
-    elif row["what"] == "served":
-        others = f"the library {row['library_seconds']:.2f} s; two at once {row['two_seconds']:.2f} s"
-        figures = f"{row['points']:8d} points × {ITERATIONS}: {row['seconds']:7.2f} s; {others}"
-    else:
-        scaled = f", scaled from {row['sample']} points" if "sample" in row else ""
-        figures = f"{row['points']:8d} points: {row['seconds']:8.1f} s{scaled}"
-    scores = f"; CD {row['cd']:.3f}, P2F {row['p2f']:.3f}" if "cd" in row else ""
-    stolen = f"; {row['stolen']:.0%} of the CPUs' time went to the host's others" if row["stolen"] >= 0.02 else ""
-    return _name(row) + figures + scores + stolen
-
-
-def _ratios(table: list[Figures]) -> Iterator[str]:
-    """What the rows say about each other."""
-    runs = [row for row in table if row["what"] == "end_to_end"]
-    for run in (run for run in runs if run["points"] == CLASSIC_POINTS):
-        same = [row for row in table if (row.get("model"), row.get("device")) == (run["model"], run["device"])]
-        for said in itertools.chain(
-            _against_the_bound(run, same), _against_others(run, table), _against_larger(run, same), _served(same)
-        ):
-            yield f"{run['model']} ({run['device']}): {said}"
-
-
-def _against_the_bound(run: Figures, same: list[Figures]) -> Iterator[str]:
-    for row in same:
-        if row["what"] == "network" and row["threads"] == run["threads"]:
-            gflops = row["gflops"] / row["patches_per_second"] * run["points"] * ITERATIONS
-            ratio = run["seconds"] / (gflops / row["sgemm_gflops"])
-            yield f"{ratio:.2f} times the seconds that its products would take at sgemm's rate"
-
-
-def _against_others(run: Figures, table: list[Figures]) -> Iterator[str]:
-    for other in table:
-        ratio = other.get("seconds", 0.0) / run["seconds"]
-        if other["what"] == "naive" and (not other["model"] or other["widths"] == run["widths"]):
-            network = "the same network" if other["model"] else "the paper's network"
-            yield f"{ratio:.1f} times as fast as the naive way with {network}, {other['patch_points']} points a patch"
-        if other["what"] == "classic":
-            accurate = other["cd"] <= run["cd"] and other["p2f"] <= run["p2f"]
-            verdict = "less accurate" if not accurate else "beaten" if ratio > 1 else "NOT BEATEN"
-            yield f"{other['method']} takes {ratio:.2f} times as long: {verdict}"
-
-
-def _against_larger(run: Figures, same: list[Figures]) -> Iterator[str]:
-    for big in same:
-        if big["what"] == "end_to_end" and big["points"] > run["points"]:
-            slower = big["seconds"] / big["points"] / (run["seconds"] / run["points"])
-            yield f"a point of {big['points']} takes {slower:.2f} times as long as one of {run['points']}"
-
-
-def _served(same: list[Figures]) -> Iterator[str]:
-    for row in same:
-        if row["what"] == "served":
-            yield f"the service takes {row['seconds'] / row['library_seconds'] - 1:+.1%} of the library's time on top"
-            yield f"two requests at once take {row['two_seconds'] / row['seconds']:.2f} times as long as one"
-
-
-def _compared(now: Figures, before: Figures) -> Iterator[str]:
-    """Ratios to an earlier run, row for row."""
-    yield f"against {before['machine']}:"
-
-    def key(row: Figures) -> tuple[Any, ...]:
-        return tuple(row.get(name) for name in ("what", "model", "method", "device", "threads", "points"))
-
-    earlier = {key(row): row for row in before["rows"]}
-    for row in now["rows"]:
-        if (old := earlier.get(key(row))) is not None:
-            figure = "patches_per_second" if row["what"] == "network" else "seconds"
-            yield f"{_name(row)}{figure}: {row[figure] / old[figure]:.2f} times what it was"
 
 
 if __name__ == "__main__":

@@ -14,12 +14,11 @@ from benchmarks.classics import (
     Rimls,
     Wlop,
     available,
-    filtered_normals,
-    oriented_normals,
     smooth,
     tuned,
-    variations,
 )
+from benchmarks.classics.mls import filtered_normals, oriented_normals
+from benchmarks.classics.tuning import variations
 
 OURS: list[Filter] = [MovingLeastSquares(0.08, 0.08, 1), Rimls(0.06, 0.05, 0.5, 1, 0.8, 1)]
 CGAL: list[Filter] = [Wlop(0.06, 4), BilateralSmoothing(40, 40, 30.0, 2), JetSmoothing(40, 1)]
