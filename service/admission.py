@@ -7,7 +7,6 @@ a large one to be done.
 from __future__ import annotations
 
 import asyncio
-import math
 import time
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Iterator
@@ -15,11 +14,8 @@ from contextlib import asynccontextmanager, contextmanager
 from enum import Enum
 
 from service.errors import QueueFullError
+from service.pace import Pace
 from service.settings import variable
-
-UNMEASURED_SECONDS = 10.0  # Retry-After before anything was measured
-LONGEST_RETRY_SECONDS = 600
-NEW_SHARE = 0.2  # of the newest measurement in the running mean
 
 
 class _Lane(Enum):
@@ -45,7 +41,7 @@ class Admission:
         self.running = 0
         self._free = {_Lane.ANY: workers, _Lane.SMALL: express}
         self._queue: deque[tuple[bool, asyncio.Future[_Lane]]] = deque()
-        self._mean_seconds: float | None = None
+        self._pace = Pace(workers)
 
     @contextmanager
     def place(self, key: str | None = None) -> Iterator[None]:
@@ -91,10 +87,10 @@ class Admission:
         except Exception:
             raise  # a file that is refused at its first line says nothing about the rate
         except BaseException:
-            self._measure(time.perf_counter() - begun)  # stopped: it would have taken longer still
+            self._pace.note(time.perf_counter() - begun)  # stopped: it would have taken longer still
             raise
         else:
-            self._measure(time.perf_counter() - begun)
+            self._pace.note(time.perf_counter() - begun)
         finally:
             self.running -= 1
             self._release(lane)
@@ -132,9 +128,4 @@ class Admission:
 
     def retry_after(self) -> int:
         """Seconds until, at the measured rate, the next place falls free."""
-        seconds = UNMEASURED_SECONDS if self._mean_seconds is None else self._mean_seconds / self.workers
-        return max(1, min(LONGEST_RETRY_SECONDS, math.ceil(seconds)))
-
-    def _measure(self, seconds: float) -> None:
-        mean = seconds if self._mean_seconds is None else self._mean_seconds
-        self._mean_seconds = mean + NEW_SHARE * (seconds - mean)
+        return self._pace.retry_after()

@@ -20,6 +20,7 @@ from service.exchange import current_request_id
 from service.handlers import explained
 from service.job import Job
 from service.jobs import Jobs
+from service.pace import Pace
 from service.problem_types import TYPES
 from service.problems import problem_of
 from service.records import Outcome, Record, State
@@ -65,7 +66,7 @@ class Runner:
         self._wake = asyncio.Event()
         self._stopping = asyncio.Event()
         self._tasks: set[asyncio.Task[None]] = set()
-        self._mean_seconds = 0.0
+        self._pace = Pace(settings.workers)
         self.running = 0
         self.waiting = 0
 
@@ -98,7 +99,7 @@ class Runner:
 
     def retry_after(self) -> int:
         """Seconds until, at the measured rate, a job leaves the queue."""
-        return max(1, min(600, round((self._mean_seconds or 10.0) / self._settings.workers)))
+        return self._pace.retry_after()
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> None:
         self._tasks.add(asyncio.create_task(work))
@@ -209,7 +210,7 @@ class Runner:
         elif record.problem:
             outcome = TYPES[record.problem.code].outcome
         if record.state is State.DONE:
-            self._mean_seconds += 0.2 * (seconds - self._mean_seconds) if self._mean_seconds else seconds
+            self._pace.note(seconds)
         self._telemetry.job_ended(record.order.model, outcome, seconds)
         log.info(
             "job",

@@ -7,8 +7,9 @@ from contextlib import ExitStack
 
 import pytest
 
-from service.admission import LONGEST_RETRY_SECONDS, Admission
+from service.admission import Admission
 from service.errors import QueueFullError
+from service.pace import LONGEST_RETRY_SECONDS, Pace
 
 
 def test_places_are_workers_and_queue_and_come_back() -> None:
@@ -118,18 +119,18 @@ def test_one_who_gives_up_waiting_takes_no_worker() -> None:
 
 
 def test_retry_after_follows_the_measured_rate() -> None:
-    admission = Admission(workers=2, queue_size=5)
-    guess = admission.retry_after()
+    pace = Pace(workers=2)
+    guess = pace.retry_after()
     assert guess >= 1
     for _ in range(60):
-        admission._measure(40.0)
-    assert admission.retry_after() == 20
+        pace.note(40.0)
+    assert pace.retry_after() == 20
     for _ in range(60):
-        admission._measure(0.001)
-    assert admission.retry_after() == 1
+        pace.note(0.001)
+    assert pace.retry_after() == 1
     for _ in range(60):
-        admission._measure(1e6)
-    assert admission.retry_after() == LONGEST_RETRY_SECONDS
+        pace.note(1e6)
+    assert pace.retry_after() == LONGEST_RETRY_SECONDS
 
 
 def test_a_file_that_is_refused_says_nothing_about_the_rate() -> None:
