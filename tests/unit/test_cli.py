@@ -336,7 +336,7 @@ def test_doctor(capsys: Capture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 
 def process(*arguments: object, stdin: bytes = b"") -> subprocess.CompletedProcess[bytes]:
     return subprocess.run(
-        [sys.executable, "-m", "pointfilter.cli", *map(str, arguments)], input=stdin, capture_output=True, check=False
+        [sys.executable, "-m", "pointfilter", *map(str, arguments)], input=stdin, capture_output=True, check=False
     )
 
 
