@@ -36,7 +36,6 @@ from pointfilter.errors import FilteringCancelledError
 from pointfilter.filtering import filter_points
 from pointfilter.metrics import closest_on_surface
 from pointfilter.models import ModelBundle, available_models, open_model
-from pointfilter.noise import bounding_box_diagonal
 
 Float64 = NDArray[np.float64]
 Row = dict[str, Any]
@@ -146,7 +145,6 @@ def _filtered(noisy: Float64, engine: Engine) -> dict[str, tuple[Float64, float,
 
     A run of four passes goes through one and two of them, and through what auto would have chosen.
     """
-    radius = engine.bundle.radius * bounding_box_diagonal(noisy)
     seen: dict[int, tuple[Float64, float]] = {}
 
     automatic = 0
@@ -159,7 +157,7 @@ def _filtered(noisy: Float64, engine: Engine) -> dict[str, tuple[Float64, float,
         filter_points(
             noisy,
             engine,
-            radius=radius,
+            least_radius=engine.bundle.radius,
             iterations=iterations,
             patch_points=engine.bundle.patch_points,
             threads=engine.threads,

@@ -52,11 +52,11 @@ from benchmarks.speed_report import CLASSIC_POINTS, ITERATIONS, Figures, compare
 from benchmarks.subjects import Column, Subject, sample_mesh
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine, available_cpus
-from pointfilter.filtering import patches_per_batch
 from pointfilter.models import DEFAULT_MODEL, available_models, open_model
 from pointfilter.noise import bounding_box_diagonal
 from pointfilter.patches import NeighbourIndex, stable_ids
 from pointfilter.pipeline import filter_cloud
+from pointfilter.prediction import patches_per_batch
 
 Float64 = NDArray[np.float64]
 

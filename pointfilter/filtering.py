@@ -15,47 +15,37 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pointfilter.automatic import look_at, with_enough_points
 from pointfilter.drift import without_drift
 from pointfilter.errors import (
     DegenerateCloudError,
     FilteringCancelledError,
-    InvalidModelError,
     ParameterError,
     TooFewPointsError,
 )
 from pointfilter.models import Auto
 from pointfilter.noise import bounding_box_diagonal
-from pointfilter.patches import NeighbourIndex, Patches, length_buckets, sampling_key, stable_ids
+from pointfilter.patches import NeighbourIndex, length_buckets, sampling_key, stable_ids
+from pointfilter.prediction import MIN_NEIGHBOURS, Float64, Predict, displacements, patches_per_batch
 from pointfilter.ranges import over_ranges
-
-Float64 = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Predict = Callable[[Float32], Float32]
-"""A network: patches (B, N, 3) float32 -> displacements (B, 3) float32, both in patch frames and in units of r."""
 
 DEFAULT_RADIUS = 0.05  # of the bounding-box diagonal (§3.2)
 DEFAULT_ITERATIONS = 2
 MAX_ITERATIONS = 100
 SMALLEST_RADIUS = 1e-150  # its square is still a number
-MIN_NEIGHBOURS = 4  # fewer, the centre included, say nothing about a surface: the point stays where it is
-ROWS_PER_BATCH = 2_048  # points a batch, all its patches together; measured: docs/adr/0005-one-thread-a-call.md
 BATCHES_PER_TASK = 8  # batches that a worker cuts in one go, so that workers seldom meet at the interpreter's lock
-SAMPLE_POINTS = 2_048  # points by which "auto" judges a cloud: the standard error stays below two hundredths
-PASSES = ((0.007, 0), (0.1, 2), (0.2, 3))
-"""What "auto" does: (mean displacement of one pass, in units of the radius; passes over a cloud that stays below it).
-
-docs/adr/0007-automatic-iterations.md has the measurements."""
 ARRIVED = 0.02  # of the radius: after the second pass, a point whose step was shorter stays where it is
-MOST_PASSES = 4  # above all of them
 DRIFT_FROM = 3  # passes: so many take more than noise away, and their drift is given back
 CENTRES_PER_COUNT = 1024  # centres whose neighbours are counted between two looks at `cancelled`
 
 
 @dataclass
 class Timings:
-    """Seconds spent, by stage, and passes done. `patches` and `infer` are summed over the threads."""
+    """Seconds spent, by stage, and what was decided. `patches` and `infer` are summed over the threads."""
 
     passes: int = 0
+    radius: float = 0.0
+    """In the unit of the points."""
     index: float = 0.0
     patches: float = 0.0
     infer: float = 0.0
@@ -112,6 +102,7 @@ def filter_points(
     predict: Predict,
     *,
     radius: float | None = None,
+    least_radius: float = DEFAULT_RADIUS,
     iterations: int | Auto = DEFAULT_ITERATIONS,
     patch_points: int = 500,
     seed: int = 0,
@@ -123,11 +114,12 @@ def filter_points(
 ) -> Float64:
     """Filters (n, 3) finite float64 points; returns the moved points, same shape, same order.
 
-    radius: absolute, in the unit of the points; by default 5 % of the bounding-box diagonal. It is taken once, from the
-    input, and kept for all iterations. iterations: a number, or "auto" for as many as the cloud needs (PASSES); a clean
-    one comes back as it was. A point that has ARRIVED stays where it is in later ones; what DRIFT_FROM and more of them
-    take away on average is given back at the end (drift.py). patch_points: N, what the network was trained with. seed:
-    of the downsampling. threads: how many batches are evaluated at once; the result does not depend on it.
+    radius: absolute, in the unit of the points; by default least_radius, a fraction of the bounding-box diagonal, or
+    more where a ball of it holds too few points for the cloud's noise (automatic.py). It is taken once, from the input,
+    and kept for all iterations. iterations: a number, or "auto" for as many as the cloud needs; a clean one comes back
+    as it was. A point that has ARRIVED stays where it is in later ones; what DRIFT_FROM and more of them take away on
+    average is given back at the end (drift.py). patch_points: N, what the network was trained with. seed: of the
+    downsampling. threads: how many batches are evaluated at once; the result does not depend on it.
     progress(done, total) is called from this thread, in units of points times iterations, from 0 on. cancelled() is
     asked between batches, from any thread. after_pass(passes, points) sees after every pass what the result of so many
     iterations is.
@@ -154,7 +146,7 @@ def filter_points(
             raise ParameterError(f"{name} must be at least 1, got {value}", limit=1, actual=value)
     if not np.isfinite(points).all():
         raise ParameterError("points must be finite", hint="filter_cloud leaves rows with NaN or Inf alone")
-    absolute_radius = resolve_radius(points, radius)
+    absolute_radius = resolve_radius(points, radius, least_radius)
     timings = timings or Timings()
     low, high = points.min(axis=0), points.max(axis=0)
     offset = low + (high - low) / 2  # large coordinates must not cost digits
@@ -162,18 +154,21 @@ def filter_points(
     ids = stable_ids(moved)
     with timings.measure("index"):
         index = NeighbourIndex(moved, absolute_radius, ids)
-    if isinstance(iterations, str):
-        with timings.measure("infer"):
-            displacement = expected_displacement(moved, ids, index, predict, patch_points, seed)
-        passes = next((passes for below, passes in PASSES if displacement < below), MOST_PASSES)
-        if passes == 0:
-            return points.copy()
-    else:
-        passes = iterations
 
     def check() -> None:
         if cancelled is not None and cancelled():
             raise FilteringCancelledError("filtering was cancelled")
+
+    look = None
+    with timings.measure("infer"):
+        if radius is None:
+            index, look = with_enough_points(index, moved, ids, predict, patch_points, seed, check)
+        elif isinstance(iterations, str):
+            look = look_at(moved, ids, index, predict, patch_points, seed, check)
+    timings.radius = absolute_radius = index.radius
+    passes = look.passes if look is not None and isinstance(iterations, str) else int(iterations)
+    if passes == 0:
+        return points.copy()
 
     def result(done: int) -> Float64:
         if done < DRIFT_FROM:
@@ -207,26 +202,6 @@ def filter_points(
     return filtered
 
 
-def expected_displacement(
-    points: Float64,
-    ids: NDArray[np.uint64],
-    index: NeighbourIndex,
-    predict: Predict,
-    patch_points: int,
-    seed: int = 0,
-) -> float:
-    """How far one pass moves a point, on average over a sample of the (n, 3) points, in units of the radius.
-
-    A measure of the noise for which the network itself is the gauge: it knows shape from noise, whatever the density.
-    index, ids: of the points. The sample depends on ids and seed, so neither on the points' order nor on their pose.
-    """
-    order = np.argsort(ids, kind="stable")
-    rows = np.random.default_rng(seed).choice(order, min(SAMPLE_POINTS, len(order)), replace=False)
-    patches = index.patches(points[rows], ids[rows], patch_points, sampling_key(seed, 0))
-    lengths = np.linalg.norm(_displacements(predict, patches), axis=1)
-    return float(lengths.mean())
-
-
 def _one_pass(
     points: Float64,
     moving: NDArray[np.bool_],
@@ -249,9 +224,9 @@ def _one_pass(
         with timings.measure("patches"):
             patches = index.patches(centres[chosen], centre_ids[chosen], length, key)
         with timings.measure("infer"):
-            displacements = _displacements(predict, patches, check)
+            answers = displacements(predict, patches, check)
         # r R⁻¹ f(.): R is a rotation, so its inverse is its transpose; rows of `frames` are the axes.
-        steps = np.einsum("bi,bij->bj", displacements, patches.frames) * index.radius
+        steps = np.einsum("bi,bij->bj", answers, patches.frames) * index.radius
         result[rows[chosen]] = centres[chosen] + steps
         return len(chosen)
 
@@ -284,29 +259,6 @@ def _one_pass(
             for future in waiting:
                 future.cancel()
     return result
-
-
-def _displacements(predict: Predict, patches: Patches, check: Callable[[], None] = lambda: None) -> Float64:
-    """The network's answers for a batch, (B, 3) in patch frames and in units of r; 0 where a patch is none.
-
-    check() is called between the network's batches.
-    """
-    count, length, _ = patches.points.shape
-    size = patches_per_batch(length)
-    parts = []
-    for start in range(0, count, size):
-        check()
-        parts.append(predict(patches.points[start : start + size]))
-    displacements = np.concatenate(parts).astype(np.float64)
-    if displacements.shape != (count, 3) or not np.isfinite(displacements).all():
-        raise InvalidModelError("the network answered with something else than finite displacements")
-    displacements[(patches.counts < MIN_NEIGHBOURS) | ~patches.points.any(axis=(1, 2))] = 0.0
-    return displacements
-
-
-def patches_per_batch(length: int) -> int:
-    """Patches of `length` points that go through the network together."""
-    return max(1, ROWS_PER_BATCH // length)
 
 
 def _count(

@@ -56,9 +56,9 @@ class ModelBundle:
     patch_points: int
     """Most points of a patch (N in §3.2)."""
     radius: float
-    """Default patch radius, as a fraction of the bounding-box diagonal."""
+    """Default patch radius, a fraction of the bounding-box diagonal; sparse clouds get a larger one (automatic.py)."""
     iterations: int | Auto
-    """Default number of iterations, or "auto": as many as the cloud needs (filtering.PASSES)."""
+    """Default number of iterations, or "auto": as many as the cloud needs (automatic.PASSES)."""
     precision: str
     """Of the encoder's products: float32 or int8."""
     parameters: int

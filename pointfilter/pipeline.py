@@ -12,8 +12,9 @@ import numpy as np
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import ParameterError
-from pointfilter.filtering import MIN_NEIGHBOURS, Timings, filter_points, resolve_radius
+from pointfilter.filtering import Timings, filter_points, resolve_radius
 from pointfilter.models import Auto
+from pointfilter.prediction import MIN_NEIGHBOURS
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,9 @@ def filter_cloud(
 ) -> tuple[PointCloud, Report]:
     """Filters every finite row of a cloud; everything else in it stays as it is.
 
-    iterations: a number, or "auto" for as many as the cloud needs. Defaults come from the engine's bundle. See
-    filtering.filter_points for progress, cancelled and what is raised.
+    iterations: a number, or "auto" for as many as the cloud needs; by default what the engine's bundle says. radius: by
+    default the bundle's share of the diagonal, or more for a sparse cloud. See filtering.filter_points for that, for
+    progress, cancelled and what is raised.
     """
     started = time.perf_counter()
     bundle = engine.bundle
@@ -93,15 +95,16 @@ def filter_cloud(
     points = cloud.xyz[finite]
     iterations = bundle.iterations if iterations is None else iterations
     timings = Timings()
-    if radius is None:
-        radius = Radius(bundle.radius, relative=True)
-    # Too few points are filter_points' business, and have no extent to speak of.
-    share_of_extent = radius.relative and len(points) >= MIN_NEIGHBOURS
-    absolute = resolve_radius(points, None, radius.value) if share_of_extent else radius.value
+    absolute = None
+    if radius is not None:
+        # Too few points are filter_points' business, and have no extent to speak of.
+        share_of_extent = radius.relative and len(points) >= MIN_NEIGHBOURS
+        absolute = resolve_radius(points, None, radius.value) if share_of_extent else radius.value
     filtered = filter_points(
         points,
         engine,
         radius=absolute,
+        least_radius=bundle.radius,
         iterations=iterations,
         patch_points=bundle.patch_points,
         seed=seed,
@@ -122,7 +125,7 @@ def filter_cloud(
         points=len(cloud),
         skipped=int(len(cloud) - finite.sum()),
         iterations=timings.passes,
-        radius=absolute,
+        radius=timings.radius,
         seed=seed,
         mean_displacement=float(displacements.mean()),
         largest_displacement=float(displacements.max()),

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pointfilter import Engine, filtering
+from pointfilter import Engine, filtering, prediction
 from pointfilter.filtering import filter_points
 from tests.clouds import crease, pooled, rotation
 
@@ -90,7 +90,7 @@ def test_batches_and_threads_change_no_bit(
     rows: int, threads: int, patch_points: int, noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = filter_points(noisy_crease, pooled, radius=0.15, patch_points=patch_points)
-    monkeypatch.setattr(filtering, "ROWS_PER_BATCH", rows)
+    monkeypatch.setattr(prediction, "ROWS_PER_BATCH", rows)
     found = filter_points(noisy_crease, pooled, radius=0.15, patch_points=patch_points, threads=threads)
     np.testing.assert_array_equal(found, expected)
 
@@ -137,7 +137,7 @@ def test_an_engine_answers_alike_in_any_batch(
         return filter_points(noisy_crease, engine, radius=0.15, iterations=1, patch_points=64, threads=threads)
 
     expected = filtered(1)
-    monkeypatch.setattr(filtering, "ROWS_PER_BATCH", rows)
+    monkeypatch.setattr(prediction, "ROWS_PER_BATCH", rows)
     np.testing.assert_allclose(filtered(threads), expected, rtol=0, atol=ENGINE_TOLERANCE * 0.15)
 
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pointfilter import filtering
+from pointfilter import filtering, prediction
 from pointfilter.errors import (
     DegenerateCloudError,
     FilteringCancelledError,
@@ -16,16 +16,12 @@ from pointfilter.errors import (
     TooFewPointsError,
 )
 from pointfilter.filtering import (
-    MIN_NEIGHBOURS,
-    MOST_PASSES,
-    PASSES,
-    Predict,
     Timings,
-    expected_displacement,
     filter_points,
     resolve_radius,
 )
 from pointfilter.patches import NeighbourIndex, sampling_key, stable_ids
+from pointfilter.prediction import MIN_NEIGHBOURS
 from tests.clouds import pooled
 
 
@@ -109,10 +105,10 @@ def test_the_radius_is_taken_once_from_the_input(noisy_crease: np.ndarray) -> No
     diagonal = np.linalg.norm(np.ptp(noisy_crease, axis=0))
     assert resolve_radius(noisy_crease, None) == pytest.approx(0.05 * diagonal)
     assert resolve_radius(noisy_crease, None, 0.2) == pytest.approx(0.2 * diagonal)
-    np.testing.assert_array_equal(
-        filter_points(noisy_crease, pooled, iterations=3),
-        filter_points(noisy_crease, pooled, iterations=3, radius=resolve_radius(noisy_crease, None)),
-    )
+    timings = Timings()
+    filtered = filter_points(noisy_crease, pooled, iterations=3, timings=timings)
+    assert timings.radius >= resolve_radius(noisy_crease, None)
+    np.testing.assert_array_equal(filtered, filter_points(noisy_crease, pooled, iterations=3, radius=timings.radius))
 
 
 def test_each_iteration_draws_anew(noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,26 +117,8 @@ def test_each_iteration_draws_anew(noisy_crease: np.ndarray, monkeypatch: pytest
     monkeypatch.setattr(
         filtering, "sampling_key", lambda seed, iteration: keys.append(real(seed, iteration)) or keys[-1]
     )
-    filter_points(noisy_crease, still, iterations=3, seed=5)
-    assert len(set(keys)) == 3
-
-
-def steps(length: float) -> Predict:
-    """A network that moves every point as far."""
-    return lambda patches: np.tile(np.array([0, 0, length], np.float32), (len(patches), 1))
-
-
-def test_automatic_iterations_follow_the_displacement(noisy_crease: np.ndarray) -> None:
-    done = []
-    for length in (PASSES[0][0] / 2, *(1.01 * below for below, _ in PASSES)):
-        timings = Timings()
-        filtered = filter_points(noisy_crease, steps(length), radius=0.3, iterations="auto", timings=timings)
-        fixed = filter_points(noisy_crease, steps(length), radius=0.3, iterations=timings.passes or 1)
-        np.testing.assert_array_equal(filtered, fixed if timings.passes else noisy_crease)
-        done.append(timings.passes)
-    assert done == [*(passes for _, passes in PASSES), MOST_PASSES]
-    assert done == sorted(done)
-    assert done[0] == 0
+    filter_points(noisy_crease, still, radius=0.1, iterations=3, seed=5)
+    assert len(keys) == len(set(keys)) == 3
 
 
 def test_points_that_have_arrived_stay_and_cost_nothing(
@@ -181,42 +159,6 @@ def test_every_pass_is_seen(noisy_crease: np.ndarray) -> None:
     assert list(seen) == [1, 2, 3]
     for passes, points in seen.items():
         np.testing.assert_array_equal(points, filter_points(noisy_crease, pooled, radius=0.15, iterations=passes))
-
-
-def test_a_clean_cloud_comes_back_as_another_array(noisy_crease: np.ndarray) -> None:
-    filtered = filter_points(noisy_crease, still, iterations="auto")
-    assert filtered is not noisy_crease
-    np.testing.assert_array_equal(filtered, noisy_crease)
-
-
-def test_what_is_expected_is_what_happens(noisy_crease: np.ndarray) -> None:
-    """All points are in the sample here, so the mean is that of the pass itself."""
-    radius = 0.1
-    ids = stable_ids(noisy_crease)
-    index = NeighbourIndex(noisy_crease, radius, ids)
-    expected = expected_displacement(noisy_crease, ids, index, pooled, patch_points=500)
-    filtered = filter_points(noisy_crease, pooled, radius=radius, iterations=1)
-    assert expected * radius == pytest.approx(np.linalg.norm(filtered - noisy_crease, axis=1).mean(), rel=1e-6)
-
-
-def test_the_sample_does_not_know_the_order_of_the_rows(
-    noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(filtering, "SAMPLE_POINTS", 40)
-
-    def expected(points: np.ndarray, seed: int) -> float:
-        ids = stable_ids(points)
-        return expected_displacement(points, ids, NeighbourIndex(points, 0.1, ids), pooled, 500, seed)
-
-    shuffle = np.random.default_rng(0).permutation(len(noisy_crease))
-    assert expected(noisy_crease, 0) == expected(noisy_crease[shuffle], 0)
-    assert expected(noisy_crease, 0) != expected(noisy_crease, 1)
-
-
-@pytest.mark.parametrize("broken", [np.nan, np.inf])
-def test_automatic_iterations_with_a_broken_network(broken: float, noisy_crease: np.ndarray) -> None:
-    with pytest.raises(InvalidModelError):
-        filter_points(noisy_crease, steps(broken), iterations="auto")
 
 
 @pytest.mark.parametrize("count", range(MIN_NEIGHBOURS))
@@ -291,7 +233,7 @@ def test_any_floats_will_do(noisy_crease: np.ndarray) -> None:
 def test_progress_only_rises_and_ends_at_the_total(
     threads: int, noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(filtering, "ROWS_PER_BATCH", 500)
+    monkeypatch.setattr(prediction, "ROWS_PER_BATCH", 500)
     calls: list[tuple[int, int]] = []
     callers = set()
 
@@ -313,7 +255,7 @@ def test_progress_only_rises_and_ends_at_the_total(
 def test_cancellation_stops_after_the_batches_under_way(
     threads: int, noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(filtering, "ROWS_PER_BATCH", 1)
+    monkeypatch.setattr(prediction, "ROWS_PER_BATCH", 1)
     evaluated = 0
     lock = threading.Lock()
     stop = threading.Event()

@@ -32,7 +32,7 @@ def test_the_defaults_are_the_bundle_s(engine: Engine, noisy_crease: np.ndarray)
     clean, report = filter_cloud(PointCloud(noisy_crease.copy()), engine)
     diagonal = float(np.linalg.norm(np.ptp(noisy_crease, axis=0)))
     assert report.iterations == engine.bundle.iterations
-    assert report.radius == pytest.approx(engine.bundle.radius * diagonal)
+    assert report.radius >= engine.bundle.radius * diagonal  # more where a ball holds too few points: test_automatic.py
     expected = filter_points(
         noisy_crease,
         engine,

@@ -1,0 +1,87 @@
+"""What a cloud needs where nobody says so: how large a ball, how many passes. The network's first step is the gauge.
+
+It knows shape from noise, whatever the density (docs/adr/0007-automatic-iterations.md). Where the step is long for the
+few points that the ball holds, the answer is as noisy as they are, and the ball grows
+(docs/adr/0014-radius-of-sparse-clouds.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pointfilter.patches import NeighbourIndex, sampling_key
+from pointfilter.prediction import Float64, Predict, displacements
+
+SAMPLE_POINTS = 2_048  # points by which a cloud is judged: the standard error stays below two hundredths
+PASSES = ((0.007, 0), (0.1, 2), (0.2, 3))
+"""(Mean displacement of one pass, in units of the radius; passes over a cloud that stays below it)."""
+MOST_PASSES = 4  # above all of them
+ENOUGH = 0.0105  # of the radius: a displacement that is longer, per root of the ball's points, asks for a larger ball
+LARGEST_GROWTH = 1.5  # of the radius: more draws thin things together
+LOOKS = 3  # at a cloud, each with a larger ball
+
+
+@dataclass(frozen=True)
+class Look:
+    """What one pass would do to a sample of a cloud. displacement: mean length, in units of the radius; neighbours:
+    median of the points in a ball."""
+
+    displacement: float
+    neighbours: float
+
+    @property
+    def passes(self) -> int:
+        """As many as the cloud needs: 0 for a clean one."""
+        return next((passes for below, passes in PASSES if self.displacement < below), MOST_PASSES)
+
+    @property
+    def growth(self) -> float:
+        """By how much the radius must grow, at least; 1: it is large enough. In a ball of r, noise is shorter by r and
+        its mean over the points, whose number goes with r², once more."""
+        if not self.passes:
+            return 1.0
+        return max(1.0, float(np.sqrt(self.displacement / np.sqrt(self.neighbours) / ENOUGH)))
+
+
+def look_at(
+    points: Float64,
+    ids: NDArray[np.uint64],
+    index: NeighbourIndex,
+    predict: Predict,
+    patch_points: int,
+    seed: int = 0,
+    check: Callable[[], None] = lambda: None,
+) -> Look:
+    """Evaluates the first pass for a sample of the (n, 3) points. index, ids: of the points.
+
+    The sample depends on ids and seed, so neither on the points' order nor on their pose.
+    """
+    order = np.argsort(ids, kind="stable")
+    rows = np.random.default_rng(seed).choice(order, min(SAMPLE_POINTS, len(order)), replace=False)
+    patches = index.patches(points[rows], ids[rows], patch_points, sampling_key(seed, 0))
+    lengths = np.linalg.norm(displacements(predict, patches, check), axis=1)
+    return Look(float(lengths.mean()), float(np.median(patches.counts)))
+
+
+def with_enough_points(
+    index: NeighbourIndex,
+    points: Float64,
+    ids: NDArray[np.uint64],
+    predict: Predict,
+    patch_points: int,
+    seed: int = 0,
+    check: Callable[[], None] = lambda: None,
+) -> tuple[NeighbourIndex, Look]:
+    """The index of the points with a radius that is large enough, from the given index's on, and a look at it."""
+    largest = LARGEST_GROWTH * index.radius
+    look = look_at(points, ids, index, predict, patch_points, seed, check)
+    for _ in range(LOOKS - 1):
+        if look.growth == 1 or index.radius >= largest:
+            break
+        index = NeighbourIndex(points, min(largest, index.radius * look.growth), ids)
+        look = look_at(points, ids, index, predict, patch_points, seed, check)
+    return index, look

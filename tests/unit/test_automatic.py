@@ -1,0 +1,155 @@
+"""What the filter decides itself: passes by the noise, the radius by noise and density."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pointfilter import Engine, PointCloud, automatic, filter_cloud
+from pointfilter.automatic import ENOUGH, LARGEST_GROWTH, MOST_PASSES, PASSES, Look, look_at
+from pointfilter.errors import InvalidModelError
+from pointfilter.filtering import Timings, filter_points
+from pointfilter.models import DEFAULT_MODEL, open_model
+from pointfilter.noise import add_noise, bounding_box_diagonal
+from pointfilter.patches import NeighbourIndex, stable_ids
+from pointfilter.pipeline import Radius
+from pointfilter.prediction import Predict
+from tests.clouds import crease, pooled
+
+
+def steps(length: float) -> Predict:
+    """A network that moves every point as far."""
+    return lambda patches: np.tile(np.array([0, 0, length], np.float32), (len(patches), 1))
+
+
+def still(patches: np.ndarray) -> np.ndarray:
+    return np.zeros((len(patches), 3), np.float32)
+
+
+def radius_of(points: np.ndarray, predict: Predict, **more: object) -> float:
+    timings = Timings()
+    filter_points(points, predict, timings=timings, **more)  # type: ignore[arg-type]
+    return timings.radius
+
+
+def test_automatic_iterations_follow_the_displacement(noisy_crease: np.ndarray) -> None:
+    done = []
+    for length in (PASSES[0][0] / 2, *(1.01 * below for below, _ in PASSES)):
+        timings = Timings()
+        filtered = filter_points(noisy_crease, steps(length), radius=0.3, iterations="auto", timings=timings)
+        fixed = filter_points(noisy_crease, steps(length), radius=0.3, iterations=timings.passes or 1)
+        np.testing.assert_array_equal(filtered, fixed if timings.passes else noisy_crease)
+        done.append(timings.passes)
+    assert done == [*(passes for _, passes in PASSES), MOST_PASSES]
+    assert done == sorted(done)
+    assert done[0] == 0
+
+
+def test_a_clean_cloud_comes_back_as_another_array(noisy_crease: np.ndarray) -> None:
+    filtered = filter_points(noisy_crease, still, iterations="auto")
+    assert filtered is not noisy_crease
+    np.testing.assert_array_equal(filtered, noisy_crease)
+
+
+def test_what_is_expected_is_what_happens(noisy_crease: np.ndarray) -> None:
+    """All points are in the sample here, so the mean is that of the pass itself."""
+    radius = 0.1
+    ids = stable_ids(noisy_crease)
+    index = NeighbourIndex(noisy_crease, radius, ids)
+    expected = look_at(noisy_crease, ids, index, pooled, patch_points=500).displacement
+    filtered = filter_points(noisy_crease, pooled, radius=radius, iterations=1)
+    assert expected * radius == pytest.approx(np.linalg.norm(filtered - noisy_crease, axis=1).mean(), rel=1e-6)
+
+
+def test_the_sample_does_not_know_the_order_of_the_rows(
+    noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(automatic, "SAMPLE_POINTS", 40)
+
+    def expected(points: np.ndarray, seed: int) -> float:
+        ids = stable_ids(points)
+        return look_at(points, ids, NeighbourIndex(points, 0.1, ids), pooled, 500, seed).displacement
+
+    shuffle = np.random.default_rng(0).permutation(len(noisy_crease))
+    assert expected(noisy_crease, 0) == expected(noisy_crease[shuffle], 0)
+    assert expected(noisy_crease, 0) != expected(noisy_crease, 1)
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+def test_automatic_iterations_with_a_broken_network(broken: float, noisy_crease: np.ndarray) -> None:
+    with pytest.raises(InvalidModelError):
+        filter_points(noisy_crease, steps(broken), iterations="auto")
+
+
+# --- the radius ---
+
+
+@pytest.fixture(scope="module")
+def default_engine() -> Engine:
+    return Engine(open_model(DEFAULT_MODEL), threads=2)
+
+
+def noisy(count: int, level: float) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    return add_noise(crease(count, rng), level, rng)
+
+
+def test_growth_is_what_brings_the_step_per_root_of_the_points_down() -> None:
+    assert Look(0.1, 400.0).growth == 1.0
+    assert Look(0.1, 25.0).growth == pytest.approx((0.1 / 5 / ENOUGH) ** 0.5)
+    assert Look(PASSES[0][0] / 2, 1.0).growth == 1.0  # clean
+
+
+def test_a_ball_grows_until_it_holds_enough(noisy_crease: np.ndarray) -> None:
+    start = 0.05 * bounding_box_diagonal(noisy_crease)
+    seen: list[Look] = []
+
+    def looked(points: np.ndarray, ids: np.ndarray, index: NeighbourIndex, *more: object) -> Look:
+        seen.append(Look(0.05 * start / index.radius, float(np.median(index.count(points)))))
+        return seen[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(automatic, "look_at", looked)
+        radius = radius_of(noisy_crease, still, iterations=1)
+    assert [look.growth > 1 for look in seen] == [True] * (len(seen) - 1) + [False]
+    assert len(seen) > 1
+    assert start < radius < LARGEST_GROWTH * start
+
+
+def test_it_stops_growing_somewhere(noisy_crease: np.ndarray) -> None:
+    start = 0.05 * bounding_box_diagonal(noisy_crease)
+    assert radius_of(noisy_crease, steps(10.0), iterations=1) == pytest.approx(LARGEST_GROWTH * start)
+
+
+def test_a_radius_that_was_given_stays(noisy_crease: np.ndarray, engine: Engine) -> None:
+    assert radius_of(noisy_crease, steps(10.0), radius=0.07, iterations=1) == 0.07
+    assert radius_of(noisy_crease, steps(10.0), radius=0.07, iterations="auto") == 0.07
+    _, report = filter_cloud(PointCloud(noisy_crease.copy()), engine, radius=Radius.parse("5%"))
+    assert report.radius == pytest.approx(0.05 * bounding_box_diagonal(noisy_crease))
+
+
+def test_sparse_noisy_clouds_are_better_off(default_engine: Engine) -> None:
+    points = noisy(1500, 0.015)
+    start = default_engine.bundle.radius * bounding_box_diagonal(points)
+    left = {}
+    for name, radius in (("fixed", Radius(start, relative=False)), ("automatic", None)):
+        filtered, report = filter_cloud(PointCloud(points.copy()), default_engine, radius=radius, iterations=2)
+        x, _, z = filtered.xyz.T
+        left[name] = float(np.minimum(np.abs(z), np.abs(z * np.cos(1.2) - x * np.sin(1.2))).mean())
+    assert report.radius > 1.1 * start
+    assert left["automatic"] < 0.9 * left["fixed"]
+
+
+@pytest.mark.parametrize(("count", "level"), [(20_000, 0.005), (3000, 0.0)])
+def test_dense_and_clean_clouds_keep_the_bundle_s(count: int, level: float, default_engine: Engine) -> None:
+    points = noisy(count, level)
+    _, report = filter_cloud(PointCloud(points), default_engine)
+    assert report.radius == pytest.approx(default_engine.bundle.radius * bounding_box_diagonal(points))
+    assert (report.iterations == 0) == (level == 0)
+
+
+def test_the_radius_scales_with_the_cloud_and_knows_no_order(default_engine: Engine) -> None:
+    points = noisy(800, 0.015)
+    radius = radius_of(points, default_engine, patch_points=192, iterations=1)
+    shuffled = np.random.default_rng(1).permutation(points)
+    assert radius_of(8 * shuffled, default_engine, patch_points=192, iterations=1) == pytest.approx(8 * radius)
