@@ -82,7 +82,12 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="passes over the cloud, or auto for as many as it needs (default: the model's)",
     )
-    command.add_argument("--radius", metavar="R", help="patch radius: 5%% of the diagonal, or 0.02 in the file's unit")
+    command.add_argument(
+        "--radius",
+        metavar="R",
+        help="patch radius: 5%% of the diagonal, or 0.02 in the file's unit (default: the model's, or more where the "
+        "cloud is sparse)",
+    )
     command.add_argument("--seed", type=int, default=0, metavar="S", help="of the downsampling (default: %(default)s)")
     command.add_argument("--device", default="auto", help=f"auto, {', '.join(DEVICES)} (default: %(default)s)")
     command.add_argument("--threads", type=int, default=0, metavar="T", help="default: all that this process may use")
