@@ -17,8 +17,11 @@ from pointfilter.patches import NeighbourIndex, sampling_key
 from pointfilter.prediction import Float64, Predict, displacements
 
 SAMPLE_POINTS = 2_048  # points by which a cloud is judged: the standard error stays below two hundredths
-PASSES = ((0.007, 0), (0.1, 2), (0.2, 3))
-"""(Mean displacement of one pass, in units of the radius; passes over a cloud that stays below it)."""
+CLEAN = 0.007  # of the radius: below such a mean displacement of one pass, the cloud is clean
+CLEAN_OF_FEW = 0.35  # the same, times the points in a ball: of few points the network cannot tell detail from noise
+CLEAN_AT_MOST = 0.02  # however few they are
+PASSES = ((0.1, 2), (0.2, 3))
+"""(Mean displacement of one pass, in units of the radius; passes over a cloud that stays below it and is not clean)."""
 MOST_PASSES = 4  # above all of them
 ENOUGH = 0.0105  # of the radius: a displacement that is longer, per root of the ball's points, asks for a larger ball
 LARGEST_GROWTH = 1.5  # of the radius: more draws thin things together
@@ -34,15 +37,21 @@ class Look:
     neighbours: float
 
     @property
+    def clean(self) -> bool:
+        return self.displacement < max(CLEAN, min(CLEAN_AT_MOST, CLEAN_OF_FEW / self.neighbours))
+
+    @property
     def passes(self) -> int:
         """As many as the cloud needs: 0 for a clean one."""
+        if self.clean:
+            return 0
         return next((passes for below, passes in PASSES if self.displacement < below), MOST_PASSES)
 
     @property
     def growth(self) -> float:
         """By how much the radius must grow, at least; 1: it is large enough. In a ball of r, noise is shorter by r and
         its mean over the points, whose number goes with r², once more."""
-        if not self.passes:
+        if self.clean:
             return 1.0
         return max(1.0, float(np.sqrt(self.displacement / np.sqrt(self.neighbours) / ENOUGH)))
 

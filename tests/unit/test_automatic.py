@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pointfilter import Engine, PointCloud, automatic, filter_cloud
-from pointfilter.automatic import ENOUGH, LARGEST_GROWTH, MOST_PASSES, PASSES, Look, look_at
+from pointfilter.automatic import CLEAN, CLEAN_AT_MOST, ENOUGH, LARGEST_GROWTH, MOST_PASSES, PASSES, Look, look_at
 from pointfilter.errors import InvalidModelError
 from pointfilter.filtering import Timings, filter_points
 from pointfilter.models import DEFAULT_MODEL, open_model
@@ -26,6 +26,16 @@ def still(patches: np.ndarray) -> np.ndarray:
     return np.zeros((len(patches), 3), np.float32)
 
 
+@pytest.fixture(scope="module")
+def default_engine() -> Engine:
+    return Engine(open_model(DEFAULT_MODEL), threads=2)
+
+
+def noisy(count: int, level: float) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    return add_noise(crease(count, rng), level, rng)
+
+
 def radius_of(points: np.ndarray, predict: Predict, **more: object) -> float:
     timings = Timings()
     filter_points(points, predict, timings=timings, **more)  # type: ignore[arg-type]
@@ -34,13 +44,13 @@ def radius_of(points: np.ndarray, predict: Predict, **more: object) -> float:
 
 def test_automatic_iterations_follow_the_displacement(noisy_crease: np.ndarray) -> None:
     done = []
-    for length in (PASSES[0][0] / 2, *(1.01 * below for below, _ in PASSES)):
+    for length in (0.99 * CLEAN, 1.01 * CLEAN, *(1.01 * below for below, _ in PASSES)):
         timings = Timings()
         filtered = filter_points(noisy_crease, steps(length), radius=0.3, iterations="auto", timings=timings)
         fixed = filter_points(noisy_crease, steps(length), radius=0.3, iterations=timings.passes or 1)
         np.testing.assert_array_equal(filtered, fixed if timings.passes else noisy_crease)
         done.append(timings.passes)
-    assert done == [*(passes for _, passes in PASSES), MOST_PASSES]
+    assert done == [0, *(passes for _, passes in PASSES), MOST_PASSES]
     assert done == sorted(done)
     assert done[0] == 0
 
@@ -81,23 +91,25 @@ def test_automatic_iterations_with_a_broken_network(broken: float, noisy_crease:
         filter_points(noisy_crease, steps(broken), iterations="auto")
 
 
+def test_of_few_neighbours_more_displacement_counts_as_clean() -> None:
+    assert [Look(1.5 * CLEAN, count).clean for count in (10, 25, 50, 1000)] == [True, True, False, False]
+    assert not Look(1.01 * CLEAN_AT_MOST, 1).clean
+    assert Look(0.99 * CLEAN, 1000).clean
+
+
+def test_a_clean_sparse_cloud_comes_back_and_a_noisy_one_does_not(default_engine: Engine) -> None:
+    for level, passes in ((0.0, 0), (0.0025, 2)):
+        _, report = filter_cloud(PointCloud(noisy(1000, level)), default_engine)
+        assert report.iterations == passes
+
+
 # --- the radius ---
-
-
-@pytest.fixture(scope="module")
-def default_engine() -> Engine:
-    return Engine(open_model(DEFAULT_MODEL), threads=2)
-
-
-def noisy(count: int, level: float) -> np.ndarray:
-    rng = np.random.default_rng(3)
-    return add_noise(crease(count, rng), level, rng)
 
 
 def test_growth_is_what_brings_the_step_per_root_of_the_points_down() -> None:
     assert Look(0.1, 400.0).growth == 1.0
     assert Look(0.1, 25.0).growth == pytest.approx((0.1 / 5 / ENOUGH) ** 0.5)
-    assert Look(PASSES[0][0] / 2, 1.0).growth == 1.0  # clean
+    assert Look(CLEAN / 2, 1.0).growth == 1.0  # clean
 
 
 def test_a_ball_grows_until_it_holds_enough(noisy_crease: np.ndarray) -> None:
