@@ -20,6 +20,11 @@ def pooled(patches: np.ndarray) -> np.ndarray:
     return np.tanh(mixed)
 
 
+def still(patches: np.ndarray) -> np.ndarray:
+    """A network that moves nothing."""
+    return np.zeros((len(patches), 3), np.float32)
+
+
 def crease(count: int, rng: np.random.Generator, angle: float = 1.2) -> np.ndarray:
     """(count, 3) points on two unit squares that share an edge and enclose `angle`."""
     along, across = rng.uniform(size=(2, count))

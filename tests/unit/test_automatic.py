@@ -14,16 +14,12 @@ from pointfilter.noise import add_noise, bounding_box_diagonal
 from pointfilter.patches import NeighbourIndex, stable_ids
 from pointfilter.pipeline import Radius
 from pointfilter.prediction import Predict
-from tests.clouds import crease, pooled
+from tests.clouds import crease, pooled, still
 
 
 def steps(length: float) -> Predict:
     """A network that moves every point as far."""
     return lambda patches: np.tile(np.array([0, 0, length], np.float32), (len(patches), 1))
-
-
-def still(patches: np.ndarray) -> np.ndarray:
-    return np.zeros((len(patches), 3), np.float32)
 
 
 @pytest.fixture(scope="module")

@@ -22,16 +22,12 @@ from pointfilter.filtering import (
 )
 from pointfilter.patches import NeighbourIndex, sampling_key, stable_ids
 from pointfilter.prediction import MIN_NEIGHBOURS
-from tests.clouds import pooled
+from tests.clouds import pooled, still
 
 
 def upwards(patches: np.ndarray) -> np.ndarray:
     """Half a radius along the z axis of every patch's frame."""
     return np.tile(np.array([0, 0, 0.5], np.float32), (len(patches), 1))
-
-
-def still(patches: np.ndarray) -> np.ndarray:
-    return np.zeros((len(patches), 3), np.float32)
 
 
 def test_a_point_moves_by_the_networks_answer_turned_back_and_scaled() -> None:
