@@ -1,8 +1,10 @@
-"""What a cloud needs where nobody says so: how large a ball, how many passes. The network's first step is the gauge.
+"""What a cloud needs where nobody says so: how large a ball, how many passes, for which of its points. The network's
+first step is the gauge.
 
 It knows shape from noise, whatever the density (docs/adr/0007-automatic-iterations.md). Where the step is long for the
 few points that the ball holds, the answer is as noisy as they are, and the ball grows
-(docs/adr/0014-radius-of-sparse-clouds.md).
+(docs/adr/0014-radius-of-sparse-clouds.md). Where most steps are next to nothing and a few are long, the noise is in
+places only, and the points between them stay as they were (docs/adr/0015-noise-in-places.md).
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from pointfilter.patches import NeighbourIndex, sampling_key
 from pointfilter.prediction import Float64, Predict, displacements
+from pointfilter.ranges import over_ranges
 
 SAMPLE_POINTS = 2_048  # points by which a cloud is judged: the standard error stays below two hundredths
 CLEAN = 0.007  # of the radius: below such a mean displacement of one pass, the cloud is clean
@@ -26,6 +29,12 @@ MOST_PASSES = 4  # above all of them
 ENOUGH = 0.0105  # of the radius: a displacement that is longer, per root of the ball's points, asks for a larger ball
 LARGEST_GROWTH = 1.5  # of the radius: more draws thin things together
 LOOKS = 3  # at a cloud, each with a larger ball
+PATCHY = (0.15, 0.5)
+"""(Of the mean step, share of the points): where more points than that take shorter steps, noise is in places only."""
+MOSTLY_CLEAN = 0.5  # of the points in a ball take steps as short as in a CLEAN cloud: it is a clean place
+UNTOUCHED = 0.03  # of the radius: a longer step is not taken for detail that looks like noise
+LOOKED_AT = 64  # points in a ball that tell whether the place is clean, at least
+POINTS_PER_TASK = 16_384
 
 
 @dataclass(frozen=True)
@@ -94,3 +103,26 @@ def with_enough_points(
         index = NeighbourIndex(points, min(largest, index.radius * look.growth), ids)
         look = look_at(points, ids, index, predict, patch_points, seed, check)
     return index, look
+
+
+def untouched(
+    lengths: Float64, index: NeighbourIndex, threads: int = 1, check: Callable[[], None] = lambda: None
+) -> NDArray[np.bool_]:
+    """Which points no noise has moved, though it has moved others: (n,) bool.
+
+    lengths: (n,) float64 of the first pass's steps, in units of the radius. index: of the points before it. All False
+    where the noise is everywhere. check() is called between tasks.
+    """
+    short, share = PATCHY
+    mean = np.sort(lengths).mean()  # sorted: the sum must not depend on the row order
+    if (lengths < short * mean).mean() <= share:
+        return np.zeros(len(lengths), dtype=np.bool_)
+    quiet = np.zeros((len(lengths), 3))
+    quiet[:, 0] = lengths[index.order] < CLEAN
+
+    def shares(first: int, last: int) -> Float64:
+        return index.averages(quiet, first, last, LOOKED_AT)[0][:, 0]
+
+    clean = np.empty(len(lengths), dtype=np.bool_)
+    clean[index.order] = np.concatenate(over_ranges(shares, len(quiet), POINTS_PER_TASK, threads, check)) > MOSTLY_CLEAN
+    return clean & (lengths < UNTOUCHED)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pointfilter.automatic import look_at, with_enough_points
+from pointfilter.automatic import look_at, untouched, with_enough_points
 from pointfilter.drift import without_drift
 from pointfilter.errors import (
     DegenerateCloudError,
@@ -117,9 +117,10 @@ def filter_points(
     radius: absolute, in the unit of the points; by default least_radius, a fraction of the bounding-box diagonal, or
     more where a ball of it holds too few points for the cloud's noise (automatic.py). It is taken once, from the input,
     and kept for all iterations. iterations: a number, or "auto" for as many as the cloud needs; a clean one comes back
-    as it was. A point that has ARRIVED stays where it is in later ones; what DRIFT_FROM and more of them take away on
-    average is given back at the end (drift.py). patch_points: N, what the network was trained with. seed: of the
-    downsampling. threads: how many batches are evaluated at once; the result does not depend on it.
+    as it was. Where noise is in places only, the points between them stay as they are (automatic.untouched); a point
+    that has ARRIVED stays where it is in later iterations; what DRIFT_FROM and more of them take away on average is
+    given back at the end (drift.py). patch_points: N, what the network was trained with. seed: of the downsampling.
+    threads: how many batches are evaluated at once; the result does not depend on it.
     progress(done, total) is called from this thread, in units of points times iterations, from 0 on. cancelled() is
     asked between batches, from any thread. after_pass(passes, points) sees after every pass what the result of so many
     iterations is.
@@ -171,10 +172,11 @@ def filter_points(
         return points.copy()
 
     def result(done: int) -> Float64:
-        if done < DRIFT_FROM:
-            return np.asarray(moved + offset)
-        with timings.measure("drift"):
-            return np.asarray(without_drift(moved, original, ids, absolute_radius, threads, check) + offset)
+        kept = moved
+        if done >= DRIFT_FROM:
+            with timings.measure("drift"):
+                kept = without_drift(moved, original, ids, absolute_radius, threads, check)
+        return np.where(kept == original, points, kept + offset)  # what did not move does not lose a digit either
 
     moving = np.ones(len(points), dtype=bool)
     for iteration in range(passes):
@@ -191,8 +193,12 @@ def filter_points(
         report(0)
         before, key = moved, sampling_key(seed, iteration)
         moved = _one_pass(before, moving, ids, index, predict, patch_points, key, threads, report, check, timings)
-        if iteration:  # the second step is the first one that sees cleaned neighbours
-            moving &= np.linalg.norm(moved - before, axis=1) >= ARRIVED * absolute_radius
+        lengths = np.linalg.norm(moved - before, axis=1) / absolute_radius
+        if iteration == 0:
+            moving = ~untouched(lengths, index, threads, check)
+            moved = np.where(moving[:, None], moved, before)
+        else:  # the second step is the first one that sees cleaned neighbours
+            moving &= lengths >= ARRIVED
         timings.passes += 1
         if after_pass is not None and iteration + 1 < passes:
             after_pass(iteration + 1, result(iteration + 1))

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pointfilter.automatic import with_enough_points
 from pointfilter.engine import Engine
 from pointfilter.filtering import filter_points
 from pointfilter.models import DEFAULT_MODEL, open_model
@@ -60,6 +61,8 @@ class DataSettings:
     """Share of the clouds whose density changes from one side to the other."""
     radius: float = 0.05
     """Patch radius as a fraction of the bounding-box diagonal (§3.2)."""
+    radius_grows: bool = False
+    """Sparse noisy clouds get the larger radius that the filter would take (docs/adr/0014), with filtered_by."""
     filtered_share: float = 0.0
     """Share of the clouds that went through filtered_by before: what later iterations see."""
     filtered_by: str = DEFAULT_MODEL
@@ -116,7 +119,7 @@ def make_cloud(noisy: Float64, clean: Float64, normals: Float64, radius: float) 
 def cloud_from_mesh(mesh: Mesh, settings: DataSettings, seed: int, engine: Engine | None = None) -> TrainingCloud:
     """One training cloud: density, noise, openness and evenness all drawn from the seed.
 
-    engine: what filters a share of the clouds before, see DataSettings.filtered_share.
+    engine: what filters a share of the clouds before and says how large a radius has to be, see DataSettings.
     """
     rng = np.random.default_rng([seed, settings.seed, 0xC10D])
     count = round(np.exp(rng.uniform(np.log(settings.fewest_points), np.log(settings.most_points))))
@@ -138,18 +141,25 @@ def cloud_from_mesh(mesh: Mesh, settings: DataSettings, seed: int, engine: Engin
         noisy = noisy[noisy @ direction < border]
         keep = points @ direction < border
         points, normals = points[keep], normals[keep]
+    radius = settings.radius * diagonal
+    if engine is not None and settings.radius_grows:
+        ids = stable_ids(noisy)
+        index, _ = with_enough_points(
+            NeighbourIndex(noisy, radius, ids), noisy, ids, engine, engine.bundle.patch_points, seed
+        )
+        radius = index.radius
     if engine is not None and rng.random() < settings.filtered_share:
         middle = noisy[rng.integers(len(noisy))]
         _, piece = cKDTree(noisy).query(middle, k=min(settings.filtered_points, len(noisy)))
         noisy = filter_points(
             noisy[np.sort(piece)],
             engine,
-            radius=settings.radius * diagonal,
+            radius=radius,
             iterations=int(rng.integers(1, FILTERED_ITERATIONS + 1)),
             patch_points=engine.bundle.patch_points,
             seed=seed,
         )
-    return make_cloud(noisy, points, normals, settings.radius * diagonal)
+    return make_cloud(noisy, points, normals, radius)
 
 
 def load_author_clouds(folder: Path, radius: float) -> list[TrainingCloud]:
@@ -187,7 +197,8 @@ def training_clouds(
         yield from load_author_clouds(clouds, settings.radius)
         return
     loaded = load_meshes(meshes) if meshes is not None else None
-    engine = Engine(open_model(settings.filtered_by), threads=1) if settings.filtered_share else None
+    needs_engine = settings.filtered_share > 0 or settings.radius_grows
+    engine = Engine(open_model(settings.filtered_by), threads=1) if needs_engine else None
     for number in range(settings.clouds):
         seed = settings.seed * 10_000 + number
         mesh = loaded[number % len(loaded)] if loaded else random_shape(seed, thin_share=settings.thin_share)

@@ -67,6 +67,18 @@ def test_a_share_of_the_clouds_is_filtered_before(
     assert len(noisy) == len(clouds)
 
 
+def test_the_ball_of_a_sparse_noisy_cloud_is_the_filter_s(tiny: TrainingSettings) -> None:
+    for noise, grows in ((0.02, True), (0.0, False)):
+        fixed = dataclasses.replace(
+            tiny.data, clouds=2, fewest_points=1000, most_points=1000, noise_low=noise, noise_high=noise
+        )
+        growing = training_clouds(dataclasses.replace(fixed, radius_grows=True))
+        for before, cloud in zip(training_clouds(fixed), growing, strict=True):
+            np.testing.assert_array_equal(cloud.points, before.points)
+            assert (cloud.index.radius > before.index.radius) == grows
+            assert cloud.clean_index.radius == cloud.index.radius
+
+
 def test_shapes_of_a_batch(clouds: list[TrainingCloud], tiny: TrainingSettings) -> None:
     batch = cut_batch(clouds, tiny.data, 0)
     assert batch.patches.shape == (16, 32, 3)

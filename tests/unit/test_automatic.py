@@ -6,7 +6,18 @@ import numpy as np
 import pytest
 
 from pointfilter import Engine, PointCloud, automatic, filter_cloud
-from pointfilter.automatic import CLEAN, CLEAN_AT_MOST, ENOUGH, LARGEST_GROWTH, MOST_PASSES, PASSES, Look, look_at
+from pointfilter.automatic import (
+    CLEAN,
+    CLEAN_AT_MOST,
+    ENOUGH,
+    LARGEST_GROWTH,
+    MOST_PASSES,
+    PASSES,
+    UNTOUCHED,
+    Look,
+    look_at,
+    untouched,
+)
 from pointfilter.errors import InvalidModelError
 from pointfilter.filtering import Timings, filter_points
 from pointfilter.models import DEFAULT_MODEL, open_model
@@ -161,3 +172,50 @@ def test_the_radius_scales_with_the_cloud_and_knows_no_order(default_engine: Eng
     radius = radius_of(points, default_engine, patch_points=192, iterations=1)
     shuffled = np.random.default_rng(1).permutation(points)
     assert radius_of(8 * shuffled, default_engine, patch_points=192, iterations=1) == pytest.approx(8 * radius)
+
+
+# --- noise in places ---
+
+PLANE = np.column_stack([np.random.default_rng(6).uniform(size=(4000, 2)), np.zeros(4000)])
+
+
+def untouched_of(lengths: np.ndarray, points: np.ndarray = PLANE, threads: int = 1) -> np.ndarray:
+    return untouched(lengths, NeighbourIndex(points, 0.1, stable_ids(points)), threads)
+
+
+def test_points_between_those_that_noise_moved_are_untouched() -> None:
+    rng = np.random.default_rng(0)
+    hit = rng.random(len(PLANE)) < 0.1
+    lengths = np.where(hit, 2 * UNTOUCHED, 0.2 * CLEAN)
+    np.testing.assert_array_equal(untouched_of(lengths), ~hit)
+    shuffle = rng.permutation(len(PLANE))
+    np.testing.assert_array_equal(untouched_of(lengths[shuffle], PLANE[shuffle], threads=2), ~hit[shuffle])
+
+
+def test_where_noise_is_everywhere_no_point_is_untouched() -> None:
+    for seed in range(5):
+        assert not untouched_of(0.02 * np.abs(np.random.default_rng(seed).normal(size=len(PLANE)))).any()
+
+
+def test_a_noisy_place_has_no_untouched_points() -> None:
+    """Some steps are short there by chance: they belong to points that another pass will move."""
+    rng = np.random.default_rng(0)
+    lengths = np.where(PLANE[:, 0] < 0.3, np.abs(rng.normal(0, 0.1, len(PLANE))), 0.2 * CLEAN)
+    found = untouched_of(lengths)
+    assert not found[PLANE[:, 0] < 0.2].any()
+    assert found[PLANE[:, 0] > 0.4].all()
+
+
+def test_impulsive_noise_goes_and_what_it_missed_stays_bit_for_bit(default_engine: Engine) -> None:
+    rng = np.random.default_rng(5)
+    clean = 1000.1 + crease(12_000, rng)
+    noisy = add_noise(clean, 0.01, rng, "impulsive")
+    hit = (noisy != clean).any(axis=1)
+    filtered = filter_points(noisy, default_engine, patch_points=default_engine.bundle.patch_points, iterations=3)
+    assert (filtered == noisy).all(axis=1)[~hit].mean() > 0.9
+
+    def distance(points: np.ndarray) -> float:
+        x, _, z = (points[hit] - 1000.1).T
+        return float(np.minimum(np.abs(z), np.abs(z * np.cos(1.2) - x * np.sin(1.2))).mean())
+
+    assert distance(filtered) < 0.25 * distance(noisy)

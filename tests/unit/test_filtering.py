@@ -76,8 +76,8 @@ def test_the_input_is_left_alone(noisy_crease: np.ndarray) -> None:
     assert filtered.shape == before.shape
 
 
-def test_a_network_that_stands_still_changes_nothing_but_the_last_bit(noisy_crease: np.ndarray) -> None:
-    np.testing.assert_allclose(filter_points(noisy_crease, still), noisy_crease, rtol=0, atol=1e-15)
+def test_a_network_that_stands_still_changes_nothing(noisy_crease: np.ndarray) -> None:
+    np.testing.assert_array_equal(filter_points(1e6 + noisy_crease, still), 1e6 + noisy_crease)
 
 
 def test_large_coordinates_keep_their_millimetres(noisy_crease: np.ndarray) -> None:
