@@ -186,7 +186,7 @@ def untouched_of(lengths: np.ndarray, points: np.ndarray = PLANE, threads: int =
 def test_points_between_those_that_noise_moved_are_untouched() -> None:
     rng = np.random.default_rng(0)
     hit = rng.random(len(PLANE)) < 0.1
-    lengths = np.where(hit, 2 * UNTOUCHED, 0.2 * CLEAN)
+    lengths = np.where(hit, 2 * UNTOUCHED, 0.1 * CLEAN)
     np.testing.assert_array_equal(untouched_of(lengths), ~hit)
     shuffle = rng.permutation(len(PLANE))
     np.testing.assert_array_equal(untouched_of(lengths[shuffle], PLANE[shuffle], threads=2), ~hit[shuffle])
