@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pointfilter.patches import NeighbourIndex, sampling_key
+from pointfilter.patches import NeighbourIndex, Patches, sampling_key
 from pointfilter.prediction import Float64, Predict, displacements
 from pointfilter.ranges import over_ranges
 
@@ -29,6 +29,8 @@ MOST_PASSES = 4  # above all of them
 ENOUGH = 0.0105  # of the radius: a displacement that is longer, per root of the ball's points, asks for a larger ball
 LARGEST_GROWTH = 1.5  # of the radius: more draws thin things together
 LOOKS = 3  # at a cloud, each with a larger ball
+TWO_SHEETS = 2.5  # kurtosis of the heights in a ball: noise on one sheet has about 3, two sheets have less
+FEWEST_HEIGHTS = 16  # of a ball whose kurtosis is taken
 PATCHY = (0.15, 0.5)
 """(Of the mean step, share of the points): where more points than that take shorter steps, noise is in places only."""
 MOSTLY_CLEAN = 0.5  # of the points in a ball take steps as short as in a CLEAN cloud: it is a clean place
@@ -40,10 +42,11 @@ POINTS_PER_TASK = 16_384
 @dataclass(frozen=True)
 class Look:
     """What one pass would do to a sample of a cloud. displacement: mean length, in units of the radius; neighbours:
-    median of the points in a ball."""
+    median of the points in a ball; kurtosis: median over the balls, of the heights of the points above their plane."""
 
     displacement: float
     neighbours: float
+    kurtosis: float = 3.0
 
     @property
     def clean(self) -> bool:
@@ -82,7 +85,7 @@ def look_at(
     rows = np.random.default_rng(seed).choice(order, min(SAMPLE_POINTS, len(order)), replace=False)
     patches = index.patches(points[rows], ids[rows], patch_points, sampling_key(seed, 0))
     lengths = np.linalg.norm(displacements(predict, patches, check), axis=1)
-    return Look(float(lengths.mean()), float(np.median(patches.counts)))
+    return Look(float(lengths.mean()), float(np.median(patches.counts)), _kurtosis(patches))
 
 
 def with_enough_points(
@@ -94,15 +97,32 @@ def with_enough_points(
     seed: int = 0,
     check: Callable[[], None] = lambda: None,
 ) -> tuple[NeighbourIndex, Look]:
-    """The index of the points with a radius that is large enough, from the given index's on, and a look at it."""
+    """The index of the points with a radius that is large enough, from the given index's on, and a look at it.
+
+    It grows no further than one sheet of the surface: points of another one are no help.
+    """
     largest = LARGEST_GROWTH * index.radius
     look = look_at(points, ids, index, predict, patch_points, seed, check)
     for _ in range(LOOKS - 1):
         if look.growth == 1 or index.radius >= largest:
             break
-        index = NeighbourIndex(points, min(largest, index.radius * look.growth), ids)
-        look = look_at(points, ids, index, predict, patch_points, seed, check)
+        larger = NeighbourIndex(points, min(largest, index.radius * look.growth), ids)
+        next_look = look_at(points, ids, larger, predict, patch_points, seed, check)
+        if next_look.kurtosis < TWO_SHEETS:
+            break
+        index, look = larger, next_look
     return index, look
+
+
+def _kurtosis(patches: Patches) -> float:
+    """Median over the patches of m₄ / m₂² of their points' z (that of the least variance); 3 where all are too few."""
+    counts = np.minimum(patches.counts, patches.points.shape[1])
+    present = np.arange(patches.points.shape[1]) < counts[:, None]
+    heights = patches.points[:, :, 2].astype(np.float64)  # padding is 0
+    heights = np.where(present, heights - (heights.sum(axis=1) / counts)[:, None], 0)
+    second, fourth = (np.power(heights, order).sum(axis=1) / counts for order in (2, 4))
+    told = (counts >= FEWEST_HEIGHTS) & (second > 0)
+    return float(np.median(fourth[told] / np.square(second[told]))) if told.any() else 3.0
 
 
 def untouched(

@@ -34,7 +34,7 @@ DEFAULT_ITERATIONS = 2
 MAX_ITERATIONS = 100
 SMALLEST_RADIUS = 1e-150  # its square is still a number
 BATCHES_PER_TASK = 8  # batches that a worker cuts in one go, so that workers seldom meet at the interpreter's lock
-ARRIVED = 0.02  # of the radius: after the second pass, a point whose step was shorter stays where it is
+ARRIVED = 0.04  # of the radius: after the second pass, a point whose step was shorter stays where it is
 DRIFT_FROM = 3  # passes: so many take more than noise away, and their drift is given back
 CENTRES_PER_COUNT = 1024  # centres whose neighbours are counted between two looks at `cancelled`
 

@@ -189,6 +189,12 @@ def load_author_clouds(folder: Path, radius: float) -> list[TrainingCloud]:
     return clouds
 
 
+def filter_of(settings: DataSettings) -> Engine | None:
+    """What DataSettings.filtered_by names, where the settings need it."""
+    needed = settings.filtered_share > 0 or settings.radius_grows
+    return Engine(open_model(settings.filtered_by), threads=1) if needed else None
+
+
 def training_clouds(
     settings: DataSettings, meshes: Path | None = None, clouds: Path | None = None
 ) -> Iterator[TrainingCloud]:
@@ -197,25 +203,25 @@ def training_clouds(
         yield from load_author_clouds(clouds, settings.radius)
         return
     loaded = load_meshes(meshes) if meshes is not None else None
-    needs_engine = settings.filtered_share > 0 or settings.radius_grows
-    engine = Engine(open_model(settings.filtered_by), threads=1) if needs_engine else None
+    engine = filter_of(settings)
     for number in range(settings.clouds):
         seed = settings.seed * 10_000 + number
         mesh = loaded[number % len(loaded)] if loaded else random_shape(seed, thin_share=settings.thin_share)
         yield cloud_from_mesh(mesh, settings, seed, engine)
 
 
-def validation_cloud(number: int, settings: DataSettings) -> TrainingCloud:
+def validation_cloud(number: int, settings: DataSettings, engine: Engine | None = None) -> TrainingCloud:
     """A cloud of a shape that no run trains on, the same for all runs with the settings' radius and clean points."""
     same = DataSettings(
         fewest_points=VALIDATION_POINTS,
         most_points=VALIDATION_POINTS,
         clean_points=settings.clean_points,
         radius=settings.radius,
+        radius_grows=settings.radius_grows,
         open_share=0.0,
         uneven_share=0.0,
     )
-    return cloud_from_mesh(random_shape(number, VALIDATION_FAMILY), same, VALIDATION_SEED + number)
+    return cloud_from_mesh(random_shape(number, VALIDATION_FAMILY), same, VALIDATION_SEED + number, engine)
 
 
 def cut_batch(clouds: list[TrainingCloud], settings: DataSettings, step: int) -> Batch:

@@ -13,6 +13,7 @@ from pointfilter.automatic import (
     LARGEST_GROWTH,
     MOST_PASSES,
     PASSES,
+    TWO_SHEETS,
     UNTOUCHED,
     Look,
     look_at,
@@ -133,6 +134,39 @@ def test_a_ball_grows_until_it_holds_enough(noisy_crease: np.ndarray) -> None:
     assert [look.growth > 1 for look in seen] == [True] * (len(seen) - 1) + [False]
     assert len(seen) > 1
     assert start < radius < LARGEST_GROWTH * start
+
+
+def heights(kind: str, seed: int, count: int = 4000) -> np.ndarray:
+    """A noisy unit square, or two of them, three standard deviations of the noise apart."""
+    rng = np.random.default_rng(seed)
+    z = rng.normal(0, 0.02, count) + (0.03 * rng.choice([-1, 1], count) if kind == "two sheets" else 0)
+    return np.column_stack([rng.uniform(size=(count, 2)), z])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_sheets_in_a_ball_are_told_from_noise(seed: int) -> None:
+    found = {}
+    for kind in ("one sheet", "two sheets"):
+        points = heights(kind, seed)
+        ids = stable_ids(points)
+        found[kind] = look_at(points, ids, NeighbourIndex(points, 0.15, ids), still, 192).kurtosis
+    assert found["two sheets"] < TWO_SHEETS < found["one sheet"]
+
+
+def test_of_too_few_points_nobody_tells_sheets() -> None:
+    points = heights("two sheets", 0, 100)
+    ids = stable_ids(points)
+    assert look_at(points, ids, NeighbourIndex(points, 0.05, ids), still, 192).kurtosis == 3
+
+
+def test_a_ball_does_not_grow_across_to_another_sheet(default_engine: Engine) -> None:
+    rng = np.random.default_rng(2)
+    sheet = np.column_stack([rng.uniform(size=(2500, 2)), rng.choice([0, 0.07], 2500)])
+    lone = sheet * [1, 1, 0]
+    for points, grows in ((lone, True), (sheet, False)):
+        noisy = add_noise(points, 0.015, np.random.default_rng(0))
+        radius = radius_of(noisy, default_engine, patch_points=192, iterations=1)
+        assert (radius > 1.01 * 0.05 * bounding_box_diagonal(noisy)) == grows
 
 
 def test_it_stops_growing_somewhere(noisy_crease: np.ndarray) -> None:
