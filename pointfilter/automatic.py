@@ -22,7 +22,7 @@ from pointfilter.ranges import over_ranges
 SAMPLE_POINTS = 2_048  # points by which a cloud is judged: the standard error stays below two hundredths
 CLEAN = 0.007  # of the radius: below such a mean displacement of one pass, the cloud is clean
 CLEAN_OF_FEW = 0.35  # the same, times the points in a ball: of few points the network cannot tell detail from noise
-CLEAN_AT_MOST = 0.02  # however few they are
+CLEAN_AT_MOST = 0.012  # however few they are
 PASSES = ((0.1, 2), (0.2, 3))
 """(Mean displacement of one pass, in units of the radius; passes over a cloud that stays below it and is not clean)."""
 MOST_PASSES = 4  # above all of them
