@@ -29,7 +29,8 @@ MOST_PASSES = 4  # above all of them
 ENOUGH = 0.0105  # of the radius: a displacement that is longer, per root of the ball's points, asks for a larger ball
 LARGEST_GROWTH = 1.5  # of the radius: more draws thin things together
 LOOKS = 3  # at a cloud, each with a larger ball
-TWO_SHEETS = 2.5  # kurtosis of the heights in a ball: noise on one sheet has about 3, two sheets have less
+TWO_SHEETS = 2.75  # kurtosis of the heights in a ball: noise on one sheet has about 3, two sheets have less
+HEAVIEST = 6.0  # kurtosis that one ball counts with
 FEWEST_HEIGHTS = 16  # of a ball whose kurtosis is taken
 PATCHY = (0.15, 0.5)
 """(Of the mean step, share of the points): where more points than that take shorter steps, noise is in places only."""
@@ -42,7 +43,7 @@ POINTS_PER_TASK = 16_384
 @dataclass(frozen=True)
 class Look:
     """What one pass would do to a sample of a cloud. displacement: mean length, in units of the radius; neighbours:
-    median of the points in a ball; kurtosis: median over the balls, of the heights of the points above their plane."""
+    median of the points in a ball; kurtosis: mean over the balls, of the heights of the points above their plane."""
 
     displacement: float
     neighbours: float
@@ -115,14 +116,20 @@ def with_enough_points(
 
 
 def _kurtosis(patches: Patches) -> float:
-    """Median over the patches of m₄ / m₂² of their points' z (that of the least variance); 3 where all are too few."""
+    """Mean over the patches of the kurtosis of their points' z (of the least variance); 3 where all are too few.
+
+    m₄ / m₂² times (n + 1) / (n - 1), which is 3 on average for n normal heights; at most HEAVIEST, for stray points.
+    """
     counts = np.minimum(patches.counts, patches.points.shape[1])
     present = np.arange(patches.points.shape[1]) < counts[:, None]
     heights = patches.points[:, :, 2].astype(np.float64)  # padding is 0
     heights = np.where(present, heights - (heights.sum(axis=1) / counts)[:, None], 0)
     second, fourth = (np.power(heights, order).sum(axis=1) / counts for order in (2, 4))
     told = (counts >= FEWEST_HEIGHTS) & (second > 0)
-    return float(np.median(fourth[told] / np.square(second[told]))) if told.any() else 3.0
+    if not told.any():
+        return 3.0
+    found = fourth[told] / np.square(second[told]) * (counts[told] + 1) / (counts[told] - 1)
+    return float(np.minimum(found, HEAVIEST).mean())
 
 
 def untouched(
