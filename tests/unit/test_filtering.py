@@ -120,7 +120,7 @@ def test_each_iteration_draws_anew(noisy_crease: np.ndarray, monkeypatch: pytest
 def test_points_that_have_arrived_stay_and_cost_nothing(
     noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Steps shrink to a tenth from pass to pass; some points arrive in the second, the others in the third."""
+    """Steps shrink from pass to pass; some points arrive in the second, the others in the third."""
     monkeypatch.setattr(filtering, "DRIFT_FROM", 99)  # steps alone
     radius, count = 0.15, len(noisy_crease)
     evaluated: list[int] = []
@@ -129,7 +129,7 @@ def test_points_that_have_arrived_stay_and_cost_nothing(
 
     def predict(patches: np.ndarray) -> np.ndarray:
         evaluated.append(passes)
-        step = filtering.ARRIVED * (12.0 if len(evaluated) % 2 else 8.0) * 0.1**passes
+        step = filtering.ARRIVED * (1.2 if len(evaluated) % 2 else 0.8) * (2.0, 1.0, 0.1)[passes]
         return np.tile(np.array([0, 0, step], np.float32), (len(patches), 1))
 
     def after(done: int, points: np.ndarray) -> None:
