@@ -189,7 +189,7 @@ def load_author_clouds(folder: Path, radius: float) -> list[TrainingCloud]:
     return clouds
 
 
-def filter_of(settings: DataSettings) -> Engine | None:
+def _filter_of(settings: DataSettings) -> Engine | None:
     """What DataSettings.filtered_by names, where the settings need it."""
     needed = settings.filtered_share > 0 or settings.radius_grows
     return Engine(open_model(settings.filtered_by), threads=1) if needed else None
@@ -203,14 +203,14 @@ def training_clouds(
         yield from load_author_clouds(clouds, settings.radius)
         return
     loaded = load_meshes(meshes) if meshes is not None else None
-    engine = filter_of(settings)
+    engine = _filter_of(settings)
     for number in range(settings.clouds):
         seed = settings.seed * 10_000 + number
         mesh = loaded[number % len(loaded)] if loaded else random_shape(seed, thin_share=settings.thin_share)
         yield cloud_from_mesh(mesh, settings, seed, engine)
 
 
-def validation_cloud(number: int, settings: DataSettings, engine: Engine | None = None) -> TrainingCloud:
+def validation_cloud(number: int, settings: DataSettings) -> TrainingCloud:
     """A cloud of a shape that no run trains on, the same for all runs with the settings' radius and clean points."""
     same = DataSettings(
         fewest_points=VALIDATION_POINTS,
@@ -218,10 +218,11 @@ def validation_cloud(number: int, settings: DataSettings, engine: Engine | None 
         clean_points=settings.clean_points,
         radius=settings.radius,
         radius_grows=settings.radius_grows,
+        filtered_by=settings.filtered_by,
         open_share=0.0,
         uneven_share=0.0,
     )
-    return cloud_from_mesh(random_shape(number, VALIDATION_FAMILY), same, VALIDATION_SEED + number, engine)
+    return cloud_from_mesh(random_shape(number, VALIDATION_FAMILY), same, VALIDATION_SEED + number, _filter_of(same))
 
 
 def cut_batch(clouds: list[TrainingCloud], settings: DataSettings, step: int) -> Batch:

@@ -20,15 +20,7 @@ from tqdm import tqdm
 from pointfilter.filtering import filter_points
 from pointfilter.metrics import chamfer_distance
 from pointfilter.noise import NOISE_KINDS
-from training.dataset import (
-    DataSettings,
-    TrainingCloud,
-    batches_ahead,
-    cut_batch,
-    filter_of,
-    training_clouds,
-    validation_cloud,
-)
+from training.dataset import DataSettings, TrainingCloud, batches_ahead, cut_batch, training_clouds, validation_cloud
 from training.grow import check_growth, grow
 from training.losses import LOSSES, LossSettings, filtering_loss
 from training.network import NetworkSettings, Pointfilter
@@ -187,8 +179,7 @@ class Run:
         settings = self.settings
         last = settings.steps if until is None else min(until, settings.steps)
         bfloat16 = _use_bfloat16(settings.precision)
-        engine = filter_of(settings.data)
-        validation = [validation_cloud(number, settings.data, engine) for number in range(settings.validation_clouds)]
+        validation = [validation_cloud(number, settings.data) for number in range(settings.validation_clouds)]
         self.network.train()
         started = time.perf_counter()
         spent = self.seconds
