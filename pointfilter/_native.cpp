@@ -13,6 +13,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 #include <vector>
 
 namespace {
@@ -20,6 +21,7 @@ namespace {
 constexpr int kKeyBins = 256;      // first digit of the selection by key
 constexpr int kHighestLevel = 40;  // of thinning: one point in 2^40
 constexpr size_t kEnough = 1024;   // points of a ball that are looked at, at least, or four times a patch's length
+constexpr double kInfinity = std::numeric_limits<double>::infinity();
 constexpr int kJacobiSweeps = 12;  // three are typical, the loop leaves as soon as the matrix is diagonal
 
 // ---------------------------------------------------------------------------------------------------------------
@@ -234,6 +236,8 @@ class Neighbourhood {
           for (int axis = 0; axis < 3; ++axis) {
             cell.low[axis] = index_.origin[axis] + index_.edge * static_cast<double>(position[axis]) - slack;
             cell.high[axis] = cell.low[axis] + index_.edge + 2 * slack;
+            if (position[axis] == 0) cell.low[axis] = -kInfinity;  // what lies beyond the grid is in its outermost cells
+            if (position[axis] == index_.shape[axis] - 1) cell.high[axis] = kInfinity;
           }
           set_stop(cell);
           if (*key == home_key) home_at = cells_.size();

@@ -23,6 +23,7 @@ from pointfilter.errors import (
     ParameterError,
     TooFewPointsError,
 )
+from pointfilter.extent import extent
 from pointfilter.models import Auto
 from pointfilter.noise import bounding_box_diagonal
 from pointfilter.patches import NeighbourIndex, length_buckets, sampling_key, stable_ids
@@ -66,7 +67,8 @@ class Timings:
 
 
 def resolve_radius(points: Float64, radius: float | None, fraction: float = DEFAULT_RADIUS) -> float:
-    """The absolute radius: the given one, or `fraction` of the bounding-box diagonal of the (n, 3) points.
+    """The absolute radius: the given one, or `fraction` of the bounding-box diagonal of the (n, 3) points, without
+    stray ones that stretch it (extent.py).
 
     Raises ParameterError for a radius that is no finite number above 0 or is larger than the diagonal,
     DegenerateCloudError when the points have no extent to take a fraction of, or one beyond double precision.
@@ -94,7 +96,7 @@ def resolve_radius(points: Float64, radius: float | None, fraction: float = DEFA
             "all points are at the same place, as far as numbers can tell: there is no extent to take a radius from",
             hint="pass radius in the units of the file",
         )
-    return diagonal * fraction
+    return extent(points) * fraction
 
 
 def filter_points(
@@ -114,7 +116,7 @@ def filter_points(
 ) -> Float64:
     """Filters (n, 3) finite float64 points; returns the moved points, same shape, same order.
 
-    radius: absolute, in the unit of the points; by default least_radius, a fraction of the bounding-box diagonal, or
+    radius: absolute, in the unit of the points; by default least_radius, a fraction of the cloud's extent, or
     more where a ball of it holds too few points for the cloud's noise (automatic.py). It is taken once, from the input,
     and kept for all iterations. iterations: a number, or "auto" for as many as the cloud needs; a clean one comes back
     as it was. Where noise is in places only, the points between them stay as they are (automatic.untouched); a point

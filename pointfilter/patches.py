@@ -64,8 +64,10 @@ class NeighbourIndex:
         self.radius = float(radius)
         low = points.min(axis=0) if len(points) else np.zeros(3)
         extent = float(np.max(points.max(axis=0) - low)) if len(points) else 0.0
-        edge = max(self.radius / CELLS_PER_RADIUS, extent / (MAX_CELLS_PER_AXIS - 1))
-        cells = np.floor((points - low) / edge).astype(np.int64)
+        edge = self.radius / CELLS_PER_RADIUS
+        if extent > edge * (MAX_CELLS_PER_AXIS - 1):
+            low, edge = _huge_grid(points, low, extent, edge)
+        cells = np.clip(np.floor((points - low) / edge), 0, MAX_CELLS_PER_AXIS - 1).astype(np.int64)
         shape = (cells.max(axis=0) + 1) if len(points) else np.ones(3, dtype=np.int64)
         keys = (cells[:, 2] * shape[1] + cells[:, 1]) * shape[0] + cells[:, 0]
         self.order: Int64 = np.lexsort((_mixed(ids), keys)).astype(np.int64)
@@ -123,6 +125,17 @@ class NeighbourIndex:
         means, squares, counts = np.empty((count, 3)), np.empty(count), np.empty(count, dtype=np.int64)
         _native.mean_vectors(self._arrays, vectors, first, self.radius, enough, means, squares, counts)
         return means, squares, counts
+
+
+def _huge_grid(points: Float64, low: Float64, extent: float, edge: float) -> tuple[Float64, float]:
+    """Origin and edge of a grid over a cloud that more cells of this edge would span than there may be.
+
+    Cells around the median, where few points lie beyond them: those share the outermost cells, and as many of them as
+    the root of all do not cost more than the others. Else coarser cells.
+    """
+    around = np.median(points, axis=0) - edge * (MAX_CELLS_PER_AXIS / 2)
+    beyond = ((points < around) | (points >= around + edge * MAX_CELLS_PER_AXIS)).any(axis=1).sum()
+    return (around, edge) if beyond**2 <= len(points) else (low, extent / (MAX_CELLS_PER_AXIS - 1))
 
 
 def _mixed(ids: UInt64) -> UInt64:

@@ -32,8 +32,9 @@ async def _order(
     radius: Annotated[
         str | None,
         Query(
-            description="Patch radius: a share of the bounding box's diagonal (5%, in an address 5%25) or a length in "
-            "the unit of the file (0.02); by default the model's share, or up to half as much again for a sparse cloud",
+            description="Patch radius: a share of the bounding box's diagonal, far stray points left out (5%, in an "
+            "address 5%25), or a length in the unit of the file (0.02); by default the model's share, "
+            "or up to half as much again for a sparse cloud",
             max_length=40,
         ),
     ] = None,

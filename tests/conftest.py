@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from pointfilter import Engine, ModelBundle, load_bundle
+from pointfilter.models import DEFAULT_MODEL, open_model
 from pointfilter.noise import add_noise
 from tests.clouds import crease
 from tests.ply_files import ply_bytes
@@ -54,6 +55,12 @@ def bundle(bundle_folder: Path) -> ModelBundle:
 @pytest.fixture(scope="session")
 def engine(bundle: ModelBundle) -> Engine:
     return Engine(bundle, "cpu", threads=2)
+
+
+@pytest.fixture(scope="session")
+def default_engine() -> Engine:
+    """The bundled model that is used where nobody names one."""
+    return Engine(open_model(DEFAULT_MODEL), threads=2)
 
 
 @pytest.fixture(scope="session")

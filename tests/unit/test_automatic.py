@@ -21,7 +21,6 @@ from pointfilter.automatic import (
 )
 from pointfilter.errors import InvalidModelError
 from pointfilter.filtering import Timings, filter_points
-from pointfilter.models import DEFAULT_MODEL, open_model
 from pointfilter.noise import add_noise, bounding_box_diagonal
 from pointfilter.patches import NeighbourIndex, stable_ids
 from pointfilter.pipeline import Radius
@@ -32,11 +31,6 @@ from tests.clouds import crease, pooled, still
 def steps(length: float) -> Predict:
     """A network that moves every point as far."""
     return lambda patches: np.tile(np.array([0, 0, length], np.float32), (len(patches), 1))
-
-
-@pytest.fixture(scope="module")
-def default_engine() -> Engine:
-    return Engine(open_model(DEFAULT_MODEL), threads=2)
 
 
 def noisy(count: int, level: float) -> np.ndarray:

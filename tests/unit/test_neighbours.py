@@ -45,13 +45,18 @@ def random_cloud(kind: str, rng: np.random.Generator) -> np.ndarray:
         return rng.uniform(-1, 1, (60, 3)).repeat(5, axis=0)
     if kind == "utm":
         return rng.uniform(-1, 1, (300, 3)) + np.array([5e5, 5e6, 120.0])
-    if kind == "stray":  # one point so far away that the grid has to be coarser than the radius
+    if kind == "stray":  # one point so far away that the grid ends before it
         return np.vstack([rng.uniform(-1, 1, (299, 3)), [[1e9, -1e9, 1e9]]])
+    if kind == "strays":  # a few in one place, and one on either side of the others
+        far = np.array([[1e9, -1e9, 1e9]] * 10 + [[-1e9, 0, 0], [0, 1e9, 0]])
+        return np.vstack([rng.uniform(-1, 1, (288, 3)), far + 0.3 * rng.normal(size=far.shape)])
+    if kind == "two places":  # so many points far away that the grid has to be coarser than the radius
+        return rng.uniform(-1, 1, (300, 3)) + np.where(rng.random((300, 1)) < 0.5, 1e9, 0)
     assert kind == "grid"
     return np.stack(np.meshgrid(*[np.arange(7.0)] * 3), axis=-1).reshape(-1, 3)
 
 
-KINDS = ["random", "clustered", "sheet", "line", "duplicates", "utm", "stray", "grid"]
+KINDS = ["random", "clustered", "sheet", "line", "duplicates", "utm", "stray", "strays", "two places", "grid"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -75,6 +80,16 @@ def test_the_index_finds_what_brute_force_finds(kind: str, seed: int, radius: fl
     points = random_cloud(kind, rng)
     centres = np.vstack([points[:40], points[:40] + distance * rng.normal(size=(40, 3))])
     assert all_neighbours(points, centres, radius) == brute_force(points, centres, radius)
+
+
+def test_a_stray_point_does_not_make_the_cells_coarser() -> None:
+    """Else all others would lie in a few cells, and a million points would cost a million times a million."""
+    points = np.random.default_rng(0).uniform(size=(500, 3))
+    without, _ = index_of(points, 0.1)
+    stray, _ = index_of(np.vstack([points, [[-5e6, 2e5, 0]]]), 0.1)
+    number_of_cells = len(without._arrays[2])
+    assert number_of_cells > 400
+    assert abs(len(stray._arrays[2]) - number_of_cells) < 40  # the grid has another origin
 
 
 def test_the_ball_is_open_as_in_the_paper() -> None:
