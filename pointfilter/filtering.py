@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pointfilter.automatic import look_at, untouched, with_enough_points
+from pointfilter.automatic import look_at, untouched, with_fitting_ball
 from pointfilter.drift import without_drift
 from pointfilter.errors import (
     DegenerateCloudError,
@@ -165,7 +165,7 @@ def filter_points(
     look = None
     with timings.measure("infer"):
         if radius is None:
-            index, look = with_enough_points(index, moved, ids, predict, patch_points, seed, check)
+            index, look = with_fitting_ball(index, moved, ids, predict, patch_points, seed, check)
         elif isinstance(iterations, str):
             look = look_at(moved, ids, index, predict, patch_points, seed, check)
     timings.radius = absolute_radius = index.radius

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pointfilter.automatic import with_enough_points
+from pointfilter.automatic import with_fitting_ball
 from pointfilter.engine import Engine
 from pointfilter.filtering import filter_points
 from pointfilter.models import DEFAULT_MODEL, open_model
@@ -144,7 +144,7 @@ def cloud_from_mesh(mesh: Mesh, settings: DataSettings, seed: int, engine: Engin
     radius = settings.radius * diagonal
     if engine is not None and settings.radius_grows:
         ids = stable_ids(noisy)
-        index, _ = with_enough_points(
+        index, _ = with_fitting_ball(
             NeighbourIndex(noisy, radius, ids), noisy, ids, engine, engine.bundle.patch_points, seed
         )
         radius = index.radius

@@ -18,6 +18,7 @@ from pointfilter.automatic import (
     Look,
     look_at,
     untouched,
+    with_fitting_ball,
 )
 from pointfilter.errors import InvalidModelError
 from pointfilter.filtering import Timings, filter_points
@@ -247,3 +248,38 @@ def test_impulsive_noise_goes_and_what_it_missed_stays_bit_for_bit(default_engin
         return float(np.minimum(np.abs(z), np.abs(z * np.cos(1.2) - x * np.sin(1.2))).mean())
 
     assert distance(filtered) < 0.25 * distance(noisy)
+
+
+def thin_plate(count: int, level: float) -> np.ndarray:
+    """(count, 3) points on both sides of a plate, 3.5 % of its width thick, with noise."""
+    rng = np.random.default_rng(8)
+    sides = np.where(rng.random(count) < 0.5, 0.035, 0.0)
+    return add_noise(np.column_stack([rng.uniform(size=(count, 2)), sides]), level, rng)
+
+
+def fitting_radius(points: np.ndarray, engine: Engine) -> float:
+    """The radius that is taken for the points, in units of the bundle's."""
+    radius = engine.bundle.radius * bounding_box_diagonal(points)
+    ids = stable_ids(points)
+    index, _ = with_fitting_ball(NeighbourIndex(points, radius, ids), points, ids, engine, engine.bundle.patch_points)
+    return index.radius / radius
+
+
+def test_the_ball_shrinks_where_two_sheets_would_become_one(default_engine: Engine) -> None:
+    points = thin_plate(20_000, 0.01)
+    assert fitting_radius(points, default_engine) in (pytest.approx(0.8), pytest.approx(0.64))
+
+    def between(radius: float | None) -> float:
+        z = filter_points(points, default_engine, radius=radius, least_radius=0.05, patch_points=192)[:, 2]
+        return float(np.minimum(np.abs(z), np.abs(z - 0.035)).mean())
+
+    assert between(None) < 0.7 * between(0.05 * bounding_box_diagonal(points))
+
+
+@pytest.mark.parametrize("level", [0.0, 0.0025, 0.03])
+def test_the_ball_stays_where_the_sheets_are_apart_or_hidden(default_engine: Engine, level: float) -> None:
+    assert fitting_radius(thin_plate(20_000, level), default_engine) == 1
+
+
+def test_the_ball_does_not_shrink_on_one_sheet(default_engine: Engine) -> None:
+    assert fitting_radius(noisy(20_000, 0.01), default_engine) == 1
