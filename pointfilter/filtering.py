@@ -116,13 +116,14 @@ def filter_points(
 ) -> Float64:
     """Filters (n, 3) finite float64 points; returns the moved points, same shape, same order.
 
-    radius: absolute, in the unit of the points; by default least_radius, a fraction of the cloud's extent, or
-    more where a ball of it holds too few points for the cloud's noise, or less where two thin sheets would become one
-    (automatic.py). It is taken once, from the input, and kept for all iterations. iterations: a number, or "auto" for as many as the cloud needs; a clean one comes back
-    as it was. Where noise is in places only, the points between them stay as they are (automatic.untouched); a point
-    that has ARRIVED stays where it is in later iterations; what DRIFT_FROM and more of them take away on average is
-    given back at the end (drift.py). patch_points: N, what the network was trained with. seed: of the downsampling.
-    threads: how many batches are evaluated at once; the result does not depend on it.
+    radius: absolute, in the unit of the points; by default least_radius, a fraction of the cloud's extent, or more
+    where a ball of it holds too few points for the cloud's noise, or less where two thin sheets would become one
+    (automatic.py). It is taken once, from the input, and kept for all iterations. iterations: a number, or "auto" for
+    as many as the cloud needs; a clean one comes back as it was. Where noise is in places only, the points between them
+    stay as they are (automatic.untouched); a point that has ARRIVED stays where it is in later iterations; what
+    DRIFT_FROM and more of them take away on average is given back at the end (drift.py). patch_points: N, what the
+    network was trained with. seed: of the downsampling. threads: how many batches are evaluated at once; the result
+    does not depend on it.
     progress(done, total) is called from this thread, in units of points times iterations, from 0 on. cancelled() is
     asked between batches, from any thread. after_pass(passes, points) sees after every pass what the result of so many
     iterations is.
