@@ -106,12 +106,13 @@ def look_at(
     patches = index.patches(points[rows], ids[rows], patch_points, sampling_key(seed, 0))
     steps = displacements(predict, patches, check)
     kurtosis, width, middles = _spread(patches)
+    before, after = (float(np.square(heights).sum()) for heights in (middles, steps[:, 2] - middles))
     return Look(
         displacement=float(np.linalg.norm(steps, axis=1).mean()),
         neighbours=float(np.median(patches.counts)),
         kurtosis=kurtosis,
         width=width,
-        kept=float(np.square(steps[:, 2] - middles).sum() / max(np.square(middles).sum(), np.finfo(float).tiny)),
+        kept=after / before if before > 0 else 1.0,
     )
 
 
@@ -170,7 +171,7 @@ def _spread(patches: Patches) -> tuple[float, float, Float64]:
     heights, middles = about_the_mean(2)
     across, along = (np.square(about_the_mean(axis)[0]).sum(axis=1) for axis in (0, 1))
     second, fourth = (np.power(heights, order).sum(axis=1) / counts for order in (2, 4))
-    told = (counts >= FEWEST_HEIGHTS) & (second > 0)
+    told = (counts >= FEWEST_HEIGHTS) & (second > 0) & (along > 0)
     if not told.any():
         return 3.0, 1.0, middles
     found = fourth[told] / np.square(second[told]) * (counts[told] + 1) / (counts[told] - 1)

@@ -281,5 +281,13 @@ def test_the_ball_stays_where_the_sheets_are_apart_or_hidden(default_engine: Eng
     assert fitting_radius(thin_plate(20_000, level), default_engine) == 1
 
 
+@pytest.mark.parametrize("extent", [(1, 0, 0), (1, 1, 0)], ids=["line", "plane"])
+def test_without_heights_nothing_merges(extent: tuple[float, ...]) -> None:
+    points = np.random.default_rng(0).uniform(size=(400, 3)) * extent
+    ids = stable_ids(points)
+    look = look_at(points, ids, NeighbourIndex(points, 0.2, ids), steps(0.5), 64)
+    assert (look.kept, look.merges) == (1.0, False)
+
+
 def test_the_ball_does_not_shrink_on_one_sheet(default_engine: Engine) -> None:
     assert fitting_radius(noisy(20_000, 0.01), default_engine) == 1
