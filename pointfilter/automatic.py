@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pointfilter.patches import NeighbourIndex, Patches, sampling_key
+from pointfilter.patches import NeighbourIndex, Patches, sample_rows, sampling_key
 from pointfilter.prediction import Float64, Predict, displacements
 from pointfilter.ranges import over_ranges
 
@@ -31,7 +31,7 @@ ENOUGH = 0.0105  # of the radius: a displacement that is longer, per root of the
 LARGEST_GROWTH = 1.5  # of the radius: more draws thin things together
 LOOKS = 3  # at a cloud, each with a larger ball
 TWO_SHEETS = 2.75  # kurtosis of the heights in a ball: noise on one sheet has about 3, two sheets have less
-BLURRED = 2.65  # kurtosis: below it two sheets are at least about as far apart as twice the noise is high
+BLURRED = 2.65  # kurtosis: below it two sheets are nearly twice as far apart as the noise is high, or more
 MERGED = 0.25  # of the squared heights are left after a step, or less: the network takes two sheets for one
 WIDE = 0.6  # of the variance along the first axis of a ball is along the second one: a sheet and no wire
 SHRINKING = 0.8  # of the radius, at a time: for two sheets that merge
@@ -101,8 +101,7 @@ def look_at(
 
     The sample depends on ids and seed, so neither on the points' order nor on their pose.
     """
-    order = np.argsort(ids, kind="stable")
-    rows = np.random.default_rng(seed).choice(order, min(SAMPLE_POINTS, len(order)), replace=False)
+    rows = sample_rows(ids, SAMPLE_POINTS, seed)
     patches = index.patches(points[rows], ids[rows], patch_points, sampling_key(seed, 0))
     steps = displacements(predict, patches, check)
     kurtosis, width, middles = _spread(patches)

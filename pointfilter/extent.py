@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pointfilter.noise import bounding_box_diagonal
-from pointfilter.patches import NeighbourIndex, stable_ids
+from pointfilter.patches import NeighbourIndex, sample_rows, stable_ids
 
 Float64 = NDArray[np.float64]
 
@@ -33,8 +33,7 @@ def stray(points: Float64) -> NDArray[np.bool_]:
         return np.zeros(len(points), dtype=np.bool_)
     ids = stable_ids(points)
     index = NeighbourIndex(points, REACH * core, ids)
-    rows = np.random.default_rng(0).choice(np.argsort(ids, kind="stable"), min(COUNTED, len(ids)), replace=False)
-    few = LONELY * float(np.median(index.count(points[rows])))
+    few = LONELY * float(np.median(index.count(points[sample_rows(ids, COUNTED, seed=0)])))
     outside[outside] = index.count(points[outside], enough=int(few) + 1) < few
     return outside
 

@@ -166,6 +166,11 @@ def stable_ids(points: Float64) -> UInt64:
     return ids
 
 
+def sample_rows(ids: UInt64, count: int, seed: int) -> Int64:
+    """Rows of at most `count` points, drawn by their (n,) ids, so that neither row order nor pose has a say."""
+    return np.random.default_rng(seed).choice(np.argsort(ids, kind="stable"), min(count, len(ids)), replace=False)
+
+
 def sampling_key(seed: int, iteration: int) -> int:
     """The 64-bit key of one iteration's downsampling."""
     return int(np.random.SeedSequence([seed, iteration]).generate_state(1, np.uint64)[0])

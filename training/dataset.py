@@ -62,7 +62,7 @@ class DataSettings:
     radius: float = 0.05
     """Patch radius as a fraction of the bounding-box diagonal (§3.2)."""
     radius_grows: bool = False
-    """Sparse noisy clouds get the larger radius that the filter would take (docs/adr/0014), with filtered_by."""
+    """Clouds get the radius that the filter would take (docs/adr/0014, 0017), with filtered_by."""
     filtered_share: float = 0.0
     """Share of the clouds that went through filtered_by before: what later iterations see."""
     filtered_by: str = DEFAULT_MODEL
