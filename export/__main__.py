@@ -18,7 +18,6 @@ from pathlib import Path
 
 from export.bundle import ParityError, RoundingError, write_bundle
 from export.checkpoint import load_checkpoint
-from pointfilter.models import AUTO, parse_iterations
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -31,13 +30,6 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--version", default="0", help="of the weights, kept in model.json (default: %(default)s)")
     parser.add_argument(
-        "--iterations",
-        type=parse_iterations,
-        default=AUTO,
-        metavar="N",
-        help="default of the bundle: a number of passes, or auto (default: %(default)s)",
-    )
-    parser.add_argument(
         "--int8",
         action="store_true",
         help="8-bit integers in the encoder: about twice as fast, all but the same answers",
@@ -49,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
         checkpoint = options.checkpoint or newest_checkpoint(Path("runs"))
         folder = options.out or Path("bundles", checkpoint.resolve().parent.name)
         loaded = load_checkpoint(checkpoint)
-        bundle, difference = write_bundle(loaded, folder, options.version, options.iterations, scores, options.int8)
+        bundle, difference = write_bundle(loaded, folder, options.version, scores, options.int8)
     except (ValueError, OSError, ParityError, RoundingError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

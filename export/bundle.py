@@ -12,21 +12,21 @@ from typing import Any
 
 import numpy as np
 import onnxruntime
-import torch
 from numpy.typing import NDArray
 
+from export.calibration import calibrate
 from export.checkpoint import Loaded
 from export.graph import OPSET, build, encoder_ranges
-from pointfilter.filtering import MAX_ITERATIONS
-from pointfilter.models import AUTO, FRAME, NAME, NAME_RULE, SCHEMA, Auto, ModelBundle, load_bundle
-from pointfilter.patches import NeighbourIndex, stable_ids
-from training.dataset import DataSettings, TrainingCloud, cut_batch, training_clouds
+from pointfilter.models import FRAME, NAME, NAME_RULE, SCHEMA, ModelBundle, load_bundle
+from training.dataset import Batch, DataSettings, TrainingCloud, cut_batch, training_clouds
+from training.own import as_network
 
 PARITY_TOLERANCE = 1e-5  # of the radius
 ROUNDING_TOLERANCE = 0.05  # of the mean displacement: what int8 may change of it, on average
 CALIBRATION_CLOUDS = 32
 CALIBRATION_PATCHES = 2048
 CALIBRATION_SEED = 77
+PARITY_PATCHES = 64
 
 
 class ParityError(RuntimeError):
@@ -41,7 +41,6 @@ def write_bundle(
     loaded: Loaded,
     folder: Path,
     version: str,
-    iterations: int | Auto = AUTO,
     scores: dict[str, Any] | None = None,
     int8: bool = False,
 ) -> tuple[ModelBundle, float]:
@@ -52,8 +51,6 @@ def write_bundle(
     and the parity error (of the float32 graph). Raises ParityError above PARITY_TOLERANCE, RoundingError above
     ROUNDING_TOLERANCE, ValueError where the folder is there and is no bundle.
     """
-    if iterations != AUTO and not 1 <= iterations <= MAX_ITERATIONS:
-        raise ValueError(f"iterations must be from 1 to {MAX_ITERATIONS}, got {iterations}")
     folder = folder.resolve()
     for what, text in (("the folder's name", folder.name), ("the version", version)):
         if not NAME.fullmatch(text):
@@ -80,14 +77,14 @@ def write_bundle(
         "opset": OPSET,
         "frame": FRAME,
         "patch_points": loaded.patch_points,
-        "radius": loaded.radius,
-        "iterations": iterations,
         "parameters": sum(parameter.numel() for parameter in loaded.network.parameters()),
         "network": {
             "encoder": list(settings.encoder),
             "decoder": list(settings.decoder),
             "norm_after_pool": settings.norm_after_pool,
+            "adaptive": settings.adaptive,
         },
+        "calibration": calibrate(serialised, loaded.patch_points).as_dict() if settings.adaptive else None,
         "precision": "int8" if int8 else "float32",
         "parity_error": error,
         "rounding_error": rounding,
@@ -108,14 +105,26 @@ def write_bundle(
 
 def _rounded(loaded: Loaded, exact: bytes) -> tuple[bytes, float]:
     """The int8 graph, and by how much it changes displacements of other patches, as a share of their mean length."""
-    calibration, others = (typical_patches(loaded.patch_points, step) for step in (0, 1))
-    serialised = build(loaded.network, encoder_ranges(loaded.network, calibration)).SerializeToString()
-    expected, answers = (
-        onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"]).run(None, {"patches": others})[0]
-        for graph in (exact, serialised)
-    )
+    ranges = encoder_ranges(loaded.network, typical_batch(loaded.patch_points, 0).patches.numpy())
+    serialised = build(loaded.network, ranges).SerializeToString()
+    others = typical_batch(loaded.patch_points, 1)
+    expected, answers = (_answers(graph, others)["displacements"] for graph in (exact, serialised))
     lengths = np.linalg.norm(expected, axis=1)
     return serialised, float(np.linalg.norm(answers - expected, axis=1).mean() / max(lengths.mean(), 1e-12))
+
+
+def _answers(serialised: bytes, batch: Batch) -> dict[str, NDArray[np.float32]]:
+    """What a serialised graph answers, by the names of its outputs."""
+    session = onnxruntime.InferenceSession(serialised, providers=["CPUExecutionProvider"])
+    given = _inputs(batch)
+    names = [entry.name for entry in session.get_outputs()]
+    found = session.run(names, {entry.name: given[entry.name] for entry in session.get_inputs()})
+    return dict(zip(names, found, strict=True))
+
+
+def _inputs(batch: Batch) -> dict[str, NDArray[Any]]:
+    tensors = {"patches": batch.patches, "context": batch.context, "queries": batch.queries, "owners": batch.owners}
+    return {name: tensor.numpy() for name, tensor in tensors.items()}
 
 
 @cache
@@ -127,14 +136,10 @@ def _calibration_clouds() -> list[TrainingCloud]:
     return list(training_clouds(settings))
 
 
-def typical_patches(patch_points: int, step: int) -> NDArray[np.float32]:
-    """CALIBRATION_PATCHES patches of procedural shapes at every noise level: (B, patch_points, 3); others a step."""
-    clouds = _calibration_clouds()
-    settings = DataSettings(
-        batch=CALIBRATION_PATCHES, clouds_per_batch=CALIBRATION_CLOUDS, patch_points=patch_points, clean_patch_points=1
-    )
-    patches: NDArray[np.float32] = cut_batch(clouds, settings, step).patches.numpy()
-    return patches
+def typical_batch(patch_points: int, step: int, patches: int = CALIBRATION_PATCHES) -> Batch:
+    """Patches of procedural shapes at every noise level; others a step."""
+    settings = DataSettings(batch=patches, clouds_per_batch=CALIBRATION_CLOUDS, patch_points=patch_points)
+    return cut_batch(_calibration_clouds(), settings, step)
 
 
 def _is_bundle(folder: Path) -> bool:
@@ -156,23 +161,14 @@ def _exchange(partial: Path, folder: Path) -> None:
 
 
 def parity_error(loaded: Loaded, serialised: bytes) -> float:
-    """Largest absolute difference between torch and onnxruntime, over real patches of several lengths and batches."""
-    session = onnxruntime.InferenceSession(serialised, providers=["CPUExecutionProvider"])
-    largest = 0.0
+    """Largest difference between the answers of torch and onnxruntime, over real patches of several lengths and
+    batches: that of displacements, or of log_errors and normals relative to their size where it is above 1."""
+    differences = []
     for length in (1, 7, loaded.patch_points // 2, loaded.patch_points):
-        patches = _patches(length)
-        with torch.inference_mode():
-            expected = loaded.network(torch.from_numpy(patches)).numpy()
-        (answer,) = session.run(None, {"patches": patches})
-        largest = max(largest, float(np.abs(answer - expected).max()))
-    return largest
-
-
-def _patches(length: int, count: int = 64) -> NDArray[np.float32]:
-    """Patches of a rippled, noisy sheet: flat, curved and ragged ones."""
-    rng = np.random.default_rng(length)
-    xy = rng.uniform(-1, 1, (4000, 2))
-    points = np.column_stack([xy, 0.1 * np.sin(8 * xy[:, 0]) * np.abs(xy[:, 1]) + rng.normal(scale=0.01, size=4000)])
-    ids = stable_ids(points)
-    index = NeighbourIndex(points, 0.2, ids)
-    return index.patches(points[:count], ids[:count], length, key=0).points
+        batch = typical_batch(length, 2, PARITY_PATCHES)
+        given = _inputs(batch)
+        expected = as_network(loaded.network)(*(given[name] for name in ("patches", "context", "queries", "owners")))
+        for name, found in _answers(serialised, batch).items():
+            wanted = getattr(expected, name)
+            differences.append((np.abs(found - wanted) / np.maximum(np.abs(wanted), 1)).max())
+    return float(np.max(differences))  # NaN where any answer is

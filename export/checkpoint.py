@@ -25,7 +25,6 @@ class Loaded:
 
     network: Pointfilter
     patch_points: int
-    radius: float
     training: dict[str, Any]
 
 
@@ -63,14 +62,14 @@ def _ours(state: dict[str, Any], path: Path) -> Loaded:
             f"{path} has checkpoint version {state.get('version')!r}, this code reads {CHECKPOINT_VERSION}"
         )
     data = state["settings"]["data"]
-    return Loaded(trained_network(state), data["patch_points"], data["radius"], training_record(state))
+    return Loaded(trained_network(state), data["patch_points"], training_record(state))
 
 
 def _authors(weights: dict[str, Tensor]) -> Loaded:
     """conv1..5 are 1 × 1 convolutions: linear layers with one axis too many."""
     encoder = _widths(weights, r"encoder\.conv(\d+)\.weight")
     decoder = _widths(weights, r"decoder\.fc(\d+)\.weight")
-    network = Pointfilter(NetworkSettings(tuple(encoder), tuple(decoder[:-1]), norm_after_pool=False))
+    network = Pointfilter(NetworkSettings(tuple(encoder), tuple(decoder[:-1]), norm_after_pool=False, adaptive=False))
     for number, layer in enumerate(network.encoder, 1):
         _fill(layer, weights, f"encoder.conv{number}")
     for number, norm in enumerate(network.encoder_norms, 1):
@@ -79,7 +78,7 @@ def _authors(weights: dict[str, Tensor]) -> Loaded:
         _fill(layer, weights, f"decoder.fc{number}")
     for number, norm in enumerate(network.decoder_norms, 1):
         _fill(norm, weights, f"decoder.bn{number}")
-    return Loaded(network.eval(), AUTHORS_PATCH_POINTS, 0.05, {"source": "checkpoint of the authors' published code"})
+    return Loaded(network.eval(), AUTHORS_PATCH_POINTS, {"source": "checkpoint of the authors' published code"})
 
 
 def _widths(weights: dict[str, Tensor], pattern: str) -> list[int]:

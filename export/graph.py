@@ -1,7 +1,10 @@
 """The network as an ONNX graph, BatchNorm folded, written node by node: no tracer decides what runs in production.
 
-    patches (B, N, 3) -> rows (B·N, 3) -> [Gemm, Relu] ... Gemm -> (B, N, C) -> ReduceMax -> [Mul] Add Relu
-            -> [Gemm, Relu] ... Gemm -> Tanh -> displacements (B, 3)
+    patches (B, N, 3) -> rows (B·N, 3) -> [Gemm, Relu] ... Gemm -> (B, N, C) -> ReduceMax -> [Mul] Add Relu -> features
+    the paper's:   features -> [Gemm, Relu] ... Gemm -> Tanh -> displacements (B, 3)
+    the adaptive:  features, context (B, 2) -> Concat -> MatMul -> Gather by owners (M,) -> + Gemm of queries (M, 3)
+                   -> Relu -> [Gemm, Relu] ... Gemm -> Split -> Tanh -> displacements (M, 3), log_errors (M, 2),
+                   normals (M, 3)
 
 The last encoder layer's bias and ReLU come after the max: both are the same for all points and never decreasing, so the
 result is the same and N times less is added and compared.
@@ -23,14 +26,14 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
-from training.network import Pointfilter
+from training.network import CONTEXT, Pointfilter
 
 OPSET = 17
 IR_VERSION = 8
 LARGEST_BIAS = 2.0**30  # in units of the products' sums, which are 32-bit
 LEVELS = 255  # of an unsigned activation above 0
 WEIGHT_LEVELS = 63  # of a signed weight on each side of 0: sums of two products fit 16 bits, which older CPUs need
-RARE = 5e-5  # share of the values that are cut off in an int8 graph
+RARE = 5e-6  # share of the values that are cut off in an int8 graph
 
 Float64 = NDArray[np.float64]
 
@@ -147,20 +150,24 @@ def build(network: Pointfilter, ranges: Sequence[float] = ()) -> onnx.ModelProto
         features = graph.node("Mul", [features, graph.constant("pooled_scale", behind.astype(np.float32))], "scaled")
     features = graph.node("Add", [features, graph.constant("pooled_bias", shift.astype(np.float32))], "biased")
     features = graph.node("Relu", [features], "features")
-    for number, pair in enumerate(network.decoder_layers()):
-        features = graph.node(
-            "Relu", [graph.product(features, *_folded(*pair), f"decoder{number}")], f"decoder{number}_relu"
-        )
+    inputs, outputs = _ends(network.settings.adaptive)
+    for number, (layer, norm) in enumerate(network.decoder_layers()):
+        matrix, bias = _folded(layer, norm)
+        if number == 0 and network.settings.adaptive:
+            features = _queried(graph, features, matrix, bias)
+        else:
+            features = graph.product(features, matrix, bias, f"decoder{number}")
+        features = graph.node("Relu", [features], f"decoder{number}_relu")
     head = graph.product(features, _array(network.head.weight).T, _array(network.head.bias), "head")
+    if network.settings.adaptive:
+        sizes = graph.constant("answer_sizes", np.array([3, 2, 3], np.int64))
+        graph.nodes.append(
+            helper.make_node("Split", [head, sizes], ["moves", "log_errors", "normals"], name="answers", axis=1)
+        )
+        head = "moves"
     graph.node("Tanh", [head], "displacements")
     model = helper.make_model(
-        helper.make_graph(
-            graph.nodes,
-            "pointfilter",
-            [helper.make_tensor_value_info("patches", TensorProto.FLOAT, ["batch", "points", 3])],
-            [helper.make_tensor_value_info("displacements", TensorProto.FLOAT, ["batch", 3])],
-            graph.weights,
-        ),
+        helper.make_graph(graph.nodes, "pointfilter", inputs, outputs, graph.weights),
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         producer_name="pointfilter export",
@@ -169,8 +176,34 @@ def build(network: Pointfilter, ranges: Sequence[float] = ()) -> onnx.ModelProto
     return model
 
 
+def _ends(adaptive: bool) -> tuple[list[onnx.ValueInfoProto], list[onnx.ValueInfoProto]]:
+    """Inputs and outputs of the graph."""
+    float32, int64 = TensorProto.FLOAT, TensorProto.INT64
+    inputs = [helper.make_tensor_value_info("patches", float32, ["batch", "points", 3])]
+    if not adaptive:
+        return inputs, [helper.make_tensor_value_info("displacements", float32, ["batch", 3])]
+    inputs += [
+        helper.make_tensor_value_info("context", float32, ["batch", 2]),
+        helper.make_tensor_value_info("queries", float32, ["asked", 3]),
+        helper.make_tensor_value_info("owners", int64, ["asked"]),
+    ]
+    answers = (("displacements", 3), ("log_errors", 2), ("normals", 3))
+    return inputs, [helper.make_tensor_value_info(name, float32, ["asked", width]) for name, width in answers]
+
+
+def _queried(graph: _Graph, features: str, matrix: Float64, bias: Float64) -> str:
+    """The decoder's first layer: what the queries of a patch share is multiplied once."""
+    width = len(matrix) - CONTEXT
+    patch = graph.node("Concat", [features, "context"], "patch_features", axis=1)
+    shared = np.concatenate([matrix[:width], matrix[width + 3 :]])
+    patch = graph.product(patch, shared, None, "decoder0_patch")
+    patch = graph.node("Gather", [patch, "owners"], "decoder0_gathered", axis=0)
+    query = graph.product("queries", matrix[width : width + 3], bias, "decoder0_query")
+    return graph.node("Add", [patch, query], "decoder0")
+
+
 def encoder_ranges(network: Pointfilter, patches: NDArray[np.float32]) -> list[float]:
-    """The largest outputs of the encoder's layers but the last on typical patches (B, N, 3), one in 20 000 left out."""
+    """The largest outputs of the encoder's layers but the last on typical patches (B, N, 3), one in 200 000 left out."""
     rows = patches.reshape(-1, 3).astype(np.float64)
     ranges = []
     for pair in network.encoder_layers()[:-1]:

@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import PointfilterError
-from pointfilter.filtering import filter_points
+from pointfilter.filter import Filtered, filter_points
 from pointfilter.limits import ReadLimits
 from pointfilter.models import ModelBundle, available_models, find_model, load_bundle
 from pointfilter.pipeline import Radius, Report, filter_cloud
@@ -26,6 +26,7 @@ except PackageNotFoundError:  # pragma: no cover - a source tree that was never 
 
 __all__ = [
     "Engine",
+    "Filtered",
     "ModelBundle",
     "PointCloud",
     "PointfilterError",

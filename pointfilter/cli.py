@@ -80,13 +80,26 @@ def build_parser() -> argparse.ArgumentParser:
         "--iterations",
         type=parse_iterations,
         metavar="N",
-        help="passes over the cloud, or auto for as many as it needs (default: the model's)",
+        help="most passes over the cloud, or auto for as many as help (the default)",
     )
     command.add_argument(
         "--radius",
         metavar="R",
-        help="patch radius: 5%% of the diagonal, or 0.02 in the file's unit (default: the model's, or more where the "
-        "cloud is sparse)",
+        help="radius of all balls: 0.02 in the file's unit, or 5%% of the diagonal (default: chosen for each point)",
+    )
+    command.add_argument(
+        "--strength", type=float, default=1.0, metavar="S", help="of each displacement, 0 to 1 (default: %(default)g)"
+    )
+    command.add_argument(
+        "--max-move",
+        type=float,
+        metavar="D",
+        help="longest displacement of a point, in the file's unit (default: none)",
+    )
+    command.add_argument(
+        "--paper",
+        action="store_true",
+        help="the paper's mode: balls of 5%% of the diagonal, two passes, all points move",
     )
     command.add_argument("--seed", type=int, default=0, metavar="S", help="of the downsampling (default: %(default)s)")
     command.add_argument("--device", default="auto", help=f"auto, {', '.join(DEVICES)} (default: %(default)s)")
@@ -135,7 +148,15 @@ def _filter(options: argparse.Namespace) -> int:
             cloud = PointCloud.read(path)
             with _Progress(str(source), options.quiet) as progress:
                 filtered, report = filter_cloud(
-                    cloud, engine, iterations=options.iterations, radius=radius, seed=options.seed, progress=progress
+                    cloud,
+                    engine,
+                    iterations=options.iterations,
+                    radius=radius,
+                    seed=options.seed,
+                    strength=options.strength,
+                    max_move=options.max_move,
+                    paper=options.paper,
+                    progress=progress,
                 )
             filtered.write(result, options.format, report.comment)
         stream = sys.stderr if to_stdout else sys.stdout
@@ -226,12 +247,15 @@ class _Progress:
 
 
 def _summary(source: str, target: str, report: Report) -> str:
-    skipped = f", {report.skipped} without a place left alone" if report.skipped else ""
-    passes = f"{report.iterations} iterations" if report.iterations else "found clean and left as it was"
-    return (
-        f"{source} -> {target}: {report.points} points{skipped}, {passes} with {report.model}, "
-        f"radius {report.radius:.4g}, mean displacement {report.mean_displacement:.3g}, {report.seconds['total']:.1f} s"
-    )
+    skipped = f", {report.skipped} rows with non-finite coordinates left unchanged" if report.skipped else ""
+    expected = f", expected error {report.expected_error:.3g}" if report.expected_error is not None else ""
+    lines = [
+        f"{source} -> {target}: {report.points} points{skipped}, {report.moved} moved in {report.iterations} passes "
+        f"with {report.model}, radius {report.radius_low:.3g} to {report.radius_high:.3g}, mean displacement "
+        f"{report.mean_displacement:.3g}{expected}, {report.seconds['total']:.1f} s",
+        *(f"warning: {warning}" for warning in report.warnings),
+    ]
+    return "\n".join(lines)
 
 
 # --- the others -------------------------------------------------------------------------------------------------------
@@ -289,8 +313,8 @@ def _models(options: argparse.Namespace) -> int:
         default = " (default)" if bundle.name == DEFAULT_MODEL else ""
         print(
             f"{bundle.name}{default}: version {bundle.version}, {bundle.parameters} weights, "
-            f"{bundle.patch_points} points a patch, radius {100 * bundle.radius:g} %, "
-            f"{bundle.iterations} iterations, {bundle.precision}, sha256 {bundle.sha256[:12]}"
+            f"{bundle.patch_points} points a patch, {'adaptive' if bundle.calibration else 'paper mode'}, "
+            f"{bundle.precision}, sha256 {bundle.sha256[:12]}"
         )
     return 0
 

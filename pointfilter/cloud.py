@@ -21,6 +21,11 @@ class Source(Protocol):
     @property
     def summary(self) -> dict[str, Any]: ...
 
+    @property
+    def single_precision(self) -> bool:
+        """Whether the file keeps coordinates as float32."""
+        ...
+
 
 @dataclass(frozen=True)
 class PointCloud:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -16,7 +17,13 @@ from numpy.typing import NDArray
 
 from pointfilter.errors import InvalidModelError, ParameterError, ProviderUnavailableError
 from pointfilter.models import ModelBundle
+from pointfilter.network import Answers
 
+Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+
+ADAPTIVE_INPUTS = {"patches", "context", "queries", "owners"}
+ADAPTIVE_OUTPUTS = ["displacements", "log_errors", "normals"]  # the paper's network has the first one alone
 THREADS = "{threads}"  # stands for their number in a provider's options
 
 
@@ -49,7 +56,7 @@ onnxruntime.disable_telemetry_events()
 
 
 class Engine:
-    """Patches (B, N, 3) float32 to displacements (B, 3) float32. Safe to call from several threads at once.
+    """A bundle as a network (network.Network): patches and queries in, answers out. Safe to call from several threads.
 
     On a CPU every call runs in its caller's thread; `threads` says how many callers to have (filter_points does it).
     That way no batch waits for another one's slowest layer, and the result cannot depend on the number of threads.
@@ -92,26 +99,32 @@ class Engine:
                 f"{chosen.provider} was asked for and {self.provider} came up",
                 hint="see the log of onnxruntime for the reason",
             )
-        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
-        if len(inputs) != 1 or len(outputs) != 1:
-            raise InvalidModelError(f"model {bundle.name!r} must have one input and one output")
-        self._input, self._output = inputs[0].name, outputs[0].name
+        inputs = {entry.name for entry in self._session.get_inputs()}
+        self._outputs = [entry.name for entry in self._session.get_outputs()]
+        self._adaptive = bundle.calibration is not None
+        if inputs != (ADAPTIVE_INPUTS if self._adaptive else {"patches"}) or self._outputs != (
+            ADAPTIVE_OUTPUTS if self._adaptive else ADAPTIVE_OUTPUTS[:1]
+        ):
+            raise InvalidModelError(f"model {bundle.name!r} has inputs {sorted(inputs)} and outputs {self._outputs}")
 
-    def __call__(self, patches: NDArray[np.float32]) -> NDArray[np.float32]:
+    def __call__(self, patches: Float32, context: Float32, queries: Float32, owners: Int64) -> Answers:
+        given: dict[str, NDArray[Any]] = {"patches": patches}
+        if self._adaptive:
+            given |= {"context": context, "queries": queries, "owners": owners}
         with self._turn:
-            answer: NDArray[np.float32] = self._session.run([self._output], {self._input: patches})[0]
-        return answer
+            return Answers(*self._session.run(self._outputs, given))
 
     def warm_up(self) -> None:
         """One real inference; raises InvalidModelError when the answer is not what the bundle promises."""
         generator = np.random.default_rng(0)
         patches = generator.uniform(-1, 1, (2, self.bundle.patch_points, 3)).astype(np.float32)
         try:
-            answer = self(patches)
+            answer = self(patches, np.zeros((2, 2), np.float32), np.zeros((2, 3), np.float32), np.arange(2))
         except Exception as error:
             raise InvalidModelError(f"model {self.bundle.name!r} takes no patches: {_first_line(error)}") from error
-        if answer.shape != (2, 3) or not np.isfinite(answer).all():
-            raise InvalidModelError(f"model {self.bundle.name!r} answered a test patch with shape {answer.shape}")
+        for values, width in zip(answer, (3, 2, 3), strict=True):
+            if values is not None and (values.shape != (2, width) or not np.isfinite(values).all()):
+                raise InvalidModelError(f"model {self.bundle.name!r} answered a test patch with shape {values.shape}")
 
 
 def _choose(device: str) -> str:

@@ -1,8 +1,8 @@
 """Model bundles: a folder with model.onnx and model.json.
 
 model.json says what the weights are and how to use them: version, sha256 of model.onnx, architecture, opset, points a
-patch, radius, default iterations (a number or "auto"), training record, scores. Bundles shipped with the package are in
-bundles/.
+patch, calibration, training record, scores. A bundle without a calibration, as all of schema 1 are, runs in the paper's
+mode. Bundles shipped with the package are in bundles/.
 """
 
 from __future__ import annotations
@@ -14,34 +14,34 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any
 
+from pointfilter.adaptive.calibration import Calibration
 from pointfilter.errors import InvalidModelError, ModelNotFoundError
 
-SCHEMA = 1
+SCHEMA = 2
+READABLE = (1, 2)
 FRAME = "pca-mean-sign"  # the frame's sign rule that the weights were trained with (patches.py)
 BUNDLES = Path(__file__).parent / "bundles"
-DEFAULT_MODEL = "pointfilter-fast-int8"
+DEFAULT_MODEL = "pointfilter-adaptive-int8"
 
-Auto = Literal["auto"]
-AUTO: Final[Auto] = "auto"
+AUTO = "auto"
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}")
 NAME_RULE = "up to 100 letters, digits and . _ + -, the first a letter or digit"
 
 _FIELDS: dict[str, type | tuple[type, ...]] = {
     "schema": int, "name": str, "version": str, "sha256": str, "opset": int, "frame": str, "patch_points": int,
-    "radius": float, "iterations": (int, str), "precision": str, "parameters": int, "network": dict, "training": dict,
-    "scores": dict,
+    "precision": str, "parameters": int, "network": dict, "training": dict, "scores": dict,
+    "calibration": (dict, type(None)),
 }  # fmt: skip
-_RANGES = {"patch_points": (1, 2**16), "radius": (1e-9, 1.0), "iterations": (1, 100)}
+MOST_PATCH_POINTS = 2**16
 PRECISIONS = ("float32", "int8")
-_WORDS = {"iterations": AUTO}  # what may stand in the place of a number
 
 
-def parse_iterations(text: str) -> int | Auto:
-    """A number of iterations or "auto", as options spell it. Raises ValueError; the range is the filter's business."""
-    return AUTO if text == AUTO else int(text)
+def parse_iterations(text: str) -> int | None:
+    """Most passes, or None for "auto", as options spell it. Raises ValueError; the range is the filter's business."""
+    return None if text == AUTO else int(text)
 
 
 @dataclass(frozen=True)
@@ -55,16 +55,14 @@ class ModelBundle:
     opset: int
     patch_points: int
     """Most points of a patch (N in §3.2)."""
-    radius: float
-    """Default patch radius, a fraction of the bounding-box diagonal; sparse clouds get a larger one (automatic.py)."""
-    iterations: int | Auto
-    """Default number of iterations, or "auto": as many as the cloud needs (automatic.PASSES)."""
     precision: str
     """Of the encoder's products: float32 or int8."""
     parameters: int
     network: dict[str, Any]
     training: dict[str, Any] = field(repr=False)
     scores: dict[str, Any] = field(repr=False)
+    calibration: Calibration | None = None
+    """How the filter uses the network's expected errors; None: the network does not tell them, the paper's mode."""
 
     @property
     def onnx(self) -> Path:
@@ -72,8 +70,9 @@ class ModelBundle:
 
     def summary(self) -> dict[str, Any]:
         """What `pointfilter models` and GET /models show."""
-        names = (field.name for field in fields(self) if field.name != "folder")
-        return {name: getattr(self, name) for name in names}
+        names = (field.name for field in fields(self) if field.name not in ("folder", "calibration"))
+        calibration = None if self.calibration is None else self.calibration.as_dict()
+        return {**{name: getattr(self, name) for name in names}, "calibration": calibration}
 
 
 def load_bundle(folder: Path) -> ModelBundle:
@@ -88,21 +87,25 @@ def load_bundle(folder: Path) -> ModelBundle:
         raise ModelNotFoundError(f"no model bundle in {folder.name!r}: it needs model.onnx and model.json") from error
     except ValueError as error:
         raise InvalidModelError(f"model.json of {folder.name!r} is not JSON: {error}") from error
-    if not isinstance(described, dict) or described.get("schema") != SCHEMA:
+    if not isinstance(described, dict) or described.get("schema") not in READABLE:
         found = described.get("schema") if isinstance(described, dict) else None
-        raise InvalidModelError(f"model.json of {folder.name!r} has schema {found!r}, this version reads {SCHEMA}")
+        readable = " and ".join(map(str, READABLE))
+        raise InvalidModelError(f"model.json of {folder.name!r} has schema {found!r}, this version reads {readable}")
+    described.setdefault("calibration", None)
     described.setdefault("precision", PRECISIONS[0])  # bundles from before there were others
     for name, kind in _FIELDS.items():
         if not isinstance(described.get(name), kind):
             raise InvalidModelError(f"model.json of {folder.name!r}: {name!r} is missing or of the wrong type")
-    for name, (low, high) in _RANGES.items():
-        if described[name] != _WORDS.get(name) and not (
-            isinstance(described[name], int | float) and low <= described[name] <= high
-        ):
-            raise InvalidModelError(
-                f"model.json of {folder.name!r}: {name!r} must be from {low} to {high}"
-                f"{f' or {_WORDS[name]!r}' if name in _WORDS else ''}, not {described[name]!r}"
-            )
+    if not 1 <= described["patch_points"] <= MOST_PATCH_POINTS:
+        raise InvalidModelError(
+            f"model.json of {folder.name!r}: 'patch_points' must be from 1 to {MOST_PATCH_POINTS}, "
+            f"not {described['patch_points']!r}"
+        )
+    if described["calibration"] is not None:
+        try:
+            described["calibration"] = Calibration.from_dict(described["calibration"])
+        except (ValueError, TypeError) as error:
+            raise InvalidModelError(f"model.json of {folder.name!r}: {error}") from error
     described["name"] = folder.resolve().name  # a bundle is found by its folder's name, so that is its name
     for name in ("name", "version"):
         if not NAME.fullmatch(described[name]):

@@ -8,13 +8,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import ParameterError
-from pointfilter.filtering import Timings, filter_points, resolve_radius
-from pointfilter.models import Auto
-from pointfilter.prediction import MIN_NEIGHBOURS
+from pointfilter.filter import Filtered, filter_points, resolve_radius
+from pointfilter.network import MIN_NEIGHBOURS
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,28 @@ class Report:
     threads: int
     points: int
     skipped: int
-    """Rows with NaN or Inf, passed through untouched."""
+    """Rows with NaN or Inf, left as they were."""
+    placeholders: int
+    """Rows at places that hold many more rows than their surroundings, such as 0 0 0 for no measurement, left as they
+    were."""
+    moved: int
+    """Rows that the filter moved; the others were expected to be no nearer to the surface after it."""
     iterations: int
-    """Passes over the cloud; 0: it was found clean and came back as it was."""
+    """Passes over the cloud."""
     radius: float
+    """Median of the balls, over the points."""
+    radius_low: float
+    radius_high: float
+    """5th and 95th percentile of the balls."""
+    expected_error: float | None
+    """Mean distance to the surface that the network expects of the filtered points; None where it does not say."""
     seed: int
     mean_displacement: float
     largest_displacement: float
     seconds: dict[str, float]
     """By stage; `patches` and `infer` are summed over the threads, `total` is the clock's."""
+    warnings: tuple[str, ...] = ()
+    """What is worth knowing before the result is used, a sentence each."""
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -77,45 +90,55 @@ def filter_cloud(
     cloud: PointCloud,
     engine: Engine,
     *,
-    iterations: int | Auto | None = None,
+    iterations: int | None = None,
     radius: Radius | None = None,
     seed: int = 0,
+    strength: float = 1.0,
+    max_move: float | None = None,
+    paper: bool = False,
     progress: Callable[[int, int], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> tuple[PointCloud, Report]:
     """Filters every finite row of a cloud; everything else in it stays as it is.
 
-    iterations: a number, or "auto" for as many as the cloud needs; by default what the engine's bundle says. radius: by
-    default the bundle's share of the diagonal, or more for a sparse cloud. See filtering.filter_points for that, for
-    progress, cancelled and what is raised.
+    iterations: most passes. radius: of all balls; by default the network chooses, point by point. strength: factor of
+    each displacement, from 0 to 1. max_move: longest displacement of a point, in the unit of the file, applied after
+    strength. paper: the paper's mode, for bundles that have another one. See filter.filter_points for progress,
+    cancelled and what is raised.
     """
     started = time.perf_counter()
+    if not 0 <= strength <= 1:
+        raise ParameterError(f"strength must be from 0 to 1, got {strength:g}", limit=1, actual=strength)
+    if max_move is not None and not (np.isfinite(max_move) and max_move > 0):
+        raise ParameterError(
+            f"max_move must be a length above 0 in the unit of the file, got {max_move:g}", actual=max_move
+        )
     bundle = engine.bundle
     finite = cloud.finite
     points = cloud.xyz[finite]
-    iterations = bundle.iterations if iterations is None else iterations
-    timings = Timings()
     absolute = None
     if radius is not None:
         # Too few points are filter_points' business, and have no extent to speak of.
         share_of_extent = radius.relative and len(points) >= MIN_NEIGHBOURS
         absolute = resolve_radius(points, None, radius.value) if share_of_extent else radius.value
-    filtered = filter_points(
+    result = filter_points(
         points,
         engine,
+        calibration=None if paper else bundle.calibration,
         radius=absolute,
-        least_radius=bundle.radius,
         iterations=iterations,
         patch_points=bundle.patch_points,
         seed=seed,
         threads=engine.threads,
         progress=progress,
         cancelled=cancelled,
-        timings=timings,
     )
+    filtered = limited(points, result.points, strength, max_move)
     displacements = np.linalg.norm(filtered - points, axis=1)
     xyz = cloud.xyz.copy()
     xyz[finite] = filtered
+    low, middle, high = _percentiles(result.radii)
+    told = np.isfinite(result.errors)
     report = Report(
         model=bundle.name,
         model_version=bundle.version,
@@ -124,11 +147,63 @@ def filter_cloud(
         threads=engine.threads,
         points=len(cloud),
         skipped=int(len(cloud) - finite.sum()),
-        iterations=timings.passes,
-        radius=timings.radius,
+        placeholders=result.placeholder_rows,
+        moved=int((displacements > 0).sum()),
+        iterations=result.passes,
+        radius=middle,
+        radius_low=low,
+        radius_high=high,
+        expected_error=float(result.errors[told].mean()) if told.any() else None,
         seed=seed,
         mean_displacement=float(displacements.mean()),
         largest_displacement=float(displacements.max()),
-        seconds={**timings.as_dict(), "total": time.perf_counter() - started},
+        seconds={**result.seconds, "total": time.perf_counter() - started},
+        warnings=_warnings(cloud, points, result),
     )
     return cloud.with_xyz(xyz), report
+
+
+def limited(
+    points: NDArray[np.float64], filtered: NDArray[np.float64], strength: float, max_move: float | None
+) -> NDArray[np.float64]:
+    """The filtered points (n, 3) with each displacement times `strength`, and then no longer than max_move."""
+    if strength == 1 and max_move is None:
+        return filtered
+    moves = strength * (filtered - points)
+    if max_move is not None:
+        moves *= np.minimum(1, max_move / np.maximum(np.linalg.norm(moves, axis=1, keepdims=True), 1e-300))
+    return points + moves
+
+
+def _percentiles(radii: NDArray[np.float64]) -> tuple[float, float, float]:
+    taken = radii[np.isfinite(radii)]
+    if not len(taken):
+        return 0.0, 0.0, 0.0
+    low, middle, high = np.percentile(taken, (5, 50, 95))
+    return float(low), float(middle), float(high)
+
+
+def _warnings(cloud: PointCloud, points: NDArray[np.float64], result: Filtered) -> tuple[str, ...]:
+    warnings = []
+    if result.placeholder_rows:
+        warnings.append(
+            f"{result.placeholder_rows} rows share places that hold many more rows than their surroundings, as where a "
+            "scanner writes 0 0 0 for no measurement; they were left as they were"
+        )
+    if not np.isfinite(result.radii).any():
+        warnings.append("there are too few points for the smallest ball; the cloud was left as it was")
+    step = _storage_step(cloud, points)
+    told = np.isfinite(result.errors) & result.moved
+    if told.any() and step > 2 * float(np.median(result.errors[told])):
+        warnings.append(
+            f"the file keeps coordinates as float32, with steps of {step:.3g} at their largest, which is more than the "
+            "error that the filter leaves; subtract an offset from the coordinates, or save them as double"
+        )
+    return tuple(warnings)
+
+
+def _storage_step(cloud: PointCloud, points: NDArray[np.float64]) -> float:
+    """Largest distance between neighbouring values of the coordinates as the file keeps them; 0 for doubles."""
+    if cloud.source is None or not cloud.source.single_precision:
+        return 0.0
+    return float(np.spacing(np.abs(points).max().astype(np.float32)))

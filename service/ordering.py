@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from fastapi import Depends, Query
 
 from pointfilter.errors import ParameterError
-from pointfilter.models import AUTO, Auto
+from pointfilter.models import AUTO
 from pointfilter.pipeline import Radius
 from service.dependencies import CallerDep, ExchangeDep, HouseDep
 from service.settings import variable
@@ -24,17 +24,15 @@ async def _order(
     iterations: Annotated[
         str | None,
         Query(
-            description="Passes over the cloud, a number from 1 on, or auto for as many as it needs; by default the "
-            "model's",
+            description="Most passes over the cloud, a number from 1 on, or auto for as many as help (the default)",
             json_schema_extra={"pattern": "^(auto|[1-9][0-9]*)$"},
         ),
     ] = None,
     radius: Annotated[
         str | None,
         Query(
-            description="Patch radius: a share of the bounding box's diagonal, far stray points left out (5%, in an "
-            "address 5%25), or a length in the unit of the file (0.02); by default the model's share, "
-            "or up to half as much again for a sparse cloud",
+            description="Radius of all balls: a length in the unit of the file (0.02), or a share of the bounding box's "
+            "diagonal (5%, in an address 5%25); by default the network chooses one for each point",
             max_length=40,
         ),
     ] = None,
@@ -43,6 +41,13 @@ async def _order(
         Literal["same", "ascii", "binary_little_endian", "binary_big_endian"],
         Query(description="Encoding of the answer"),
     ] = "same",
+    strength: Annotated[float, Query(description="Of each displacement: 0 moves nothing, 1 all the way", ge=0, le=1)] = 1,
+    max_move: Annotated[
+        float | None, Query(description="Longest displacement of a point, in the unit of the file", gt=0)
+    ] = None,
+    paper: Annotated[
+        bool, Query(description="The paper's mode: balls of 5 % of the bounding box's diagonal, two passes")
+    ] = False,
 ) -> Order:
     """Raises ParameterError, ModelError."""
     bundle = await asyncio.to_thread(house.engines.bundle, model or house.settings.model)
@@ -53,16 +58,19 @@ async def _order(
         radius=None if radius is None else Radius.parse(radius),
         seed=seed,
         encoding=format,
+        strength=strength,
+        max_move=max_move,
+        paper=paper,
     )
 
 
 OrderDep = Annotated[Order, Depends(_order)]
 
 
-def _iterations(text: str, most: int) -> int | Auto:
+def _iterations(text: str, most: int) -> int | None:
     """Raises ParameterError."""
     if text == AUTO:
-        return AUTO
+        return None
     number = int(text) if re.fullmatch(r"-?[0-9]{1,9}", text) else None
     if number is None or not 1 <= number <= most:
         raise ParameterError(

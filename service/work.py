@@ -21,7 +21,6 @@ from pointfilter.engine import Engine
 from pointfilter.errors import FilteringCancelledError, InputError, LimitExceededError
 from pointfilter.formats.ply_header import read_header
 from pointfilter.limits import ReadLimits
-from pointfilter.models import Auto
 from pointfilter.pipeline import Radius, Report, filter_cloud
 from service.errors import ClientGoneError
 
@@ -36,10 +35,13 @@ class Order:
     """What to do: the request's parameters, checked."""
 
     model: str
-    iterations: int | Auto | None
+    iterations: int | None
     radius: Radius | None
     seed: int
     encoding: str
+    strength: float = 1.0
+    max_move: float | None = None
+    paper: bool = False
 
 
 @dataclass(frozen=True)
@@ -80,10 +82,13 @@ def carry_out(
         iterations=order.iterations,
         radius=order.radius,
         seed=order.seed,
+        strength=order.strength,
+        max_move=order.max_move,
+        paper=order.paper,
         progress=lambda done, total: progress(done, total, points),
         cancelled=stopped,
     )
-    seconds.update({stage: report.seconds[stage] for stage in ("index", "patches", "infer", "drift")})
+    seconds.update({stage: report.seconds[stage] for stage in ("index", "balls", "patches", "infer")})
     _go_on(stopped)
     started = time.perf_counter()
     filtered.write(target, order.encoding, report.comment)

@@ -2,13 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
+
+from pointfilter import filter as filter_module
+from pointfilter.network import Answers, Network
 
 _DIRECTIONS = np.random.default_rng(7).normal(size=(3, 24)).astype(np.float32)
 _MIXTURE = (0.1 * np.random.default_rng(8).normal(size=(24, 3))).astype(np.float32)
 
 
-def pooled(patches: np.ndarray) -> np.ndarray:
+def paper_network(displace: Callable[[np.ndarray], np.ndarray]) -> Network:
+    """The network of the paper's kind that answers with `displace` of its patches."""
+
+    def ask(patches: np.ndarray, context: np.ndarray, queries: np.ndarray, owners: np.ndarray) -> Answers:
+        np.testing.assert_array_equal(owners, np.arange(len(patches)))
+        assert not queries.any()
+        return Answers(displace(patches))
+
+    return ask
+
+
+def filter_points(points: np.ndarray, network: Network, **options: Any) -> np.ndarray:
+    """The points of what the filter gives."""
+    return filter_module.filter_points(points, network, **options).points
+
+
+def pooled_displacements(patches: np.ndarray) -> np.ndarray:
     """A network without a network: max over the points of fixed linear maps, mixed, then tanh.
 
     Spelled out product by product, so that no library call may add in another order for another batch.
@@ -20,9 +42,24 @@ def pooled(patches: np.ndarray) -> np.ndarray:
     return np.tanh(mixed)
 
 
-def still(patches: np.ndarray) -> np.ndarray:
-    """A network that moves nothing."""
+def no_displacements(patches: np.ndarray) -> np.ndarray:
     return np.zeros((len(patches), 3), np.float32)
+
+
+pooled = paper_network(pooled_displacements)
+still = paper_network(no_displacements)
+
+
+def adaptive_pooled(
+    patches: np.ndarray, context: np.ndarray, queries: np.ndarray, owners: np.ndarray
+) -> Answers:
+    """An adaptive network without a network. Its answers differ from query to query; the ratio of its errors depends on
+    the points in the ball, on the pass and on the displacement."""
+    moves = 0.5 * pooled_displacements(patches)[owners] - 0.3 * queries * np.abs(queries[:, 2:])
+    lengths = np.sqrt(np.square(moves).sum(axis=1))
+    balls = np.abs(context[owners, 0])
+    log_errors = np.stack([balls - 2.0 + 0.5 * context[owners, 1], np.log(lengths + 0.1) + 1.0], axis=1)
+    return Answers(moves.astype(np.float32), log_errors.astype(np.float32), np.ones_like(queries))
 
 
 def crease(count: int, rng: np.random.Generator, angle: float = 1.2) -> np.ndarray:

@@ -40,10 +40,10 @@ def bundle_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from training.network import NetworkSettings, Pointfilter
 
     torch.manual_seed(0)
-    network = Pointfilter(NetworkSettings(encoder=(16, 32), decoder=(16,), norm_after_pool=True))
+    network = Pointfilter(NetworkSettings(encoder=(16, 32), decoder=(16,), adaptive=False))
     network(torch.randn(64, 20, 3))  # moves the running statistics off their defaults
     folder = tmp_path_factory.mktemp("bundles") / "tiny"
-    write_bundle(Loaded(network.eval(), patch_points=64, radius=0.1, training={}), folder, "0.0.1", iterations=2)
+    write_bundle(Loaded(network.eval(), patch_points=64, training={}), folder, "0.0.1")
     return folder
 
 

@@ -40,11 +40,9 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--resume",
         action="store_true",
-        help="go on from the folder's checkpoint, exactly, with the settings that it holds",
+        help="go on from the folder's checkpoint, exactly, with its settings: takes neither --set nor --seed",
     )
-    parser.add_argument(
-        "--init", type=Path, help="start from the weights of this checkpoint.pt; a narrower network grows into this one"
-    )
+    parser.add_argument("--init", type=Path, metavar="CHECKPOINT", help="start from the weights of this checkpoint.pt")
     parser.add_argument("--until", type=int, metavar="STEP", help="stop after this step, with a checkpoint")
     parser.add_argument("--seed", type=int, default=None, help="of weights, shapes, noise and batches (default: 0)")
     data = parser.add_argument_group("data", "procedural shapes unless one of these is given")
@@ -109,6 +107,8 @@ def main(arguments: list[str] | None = None) -> int:
     if options.seed is not None:
         overrides += [f"seed={options.seed}", f"data.seed={options.seed}"]
     try:
+        if options.resume and overrides:
+            raise ValueError("--resume takes its settings from the checkpoint: leave out --set and --seed")
         if options.resume and not (folder / "checkpoint.pt").is_file():
             raise FileNotFoundError(f"--resume: no checkpoint.pt in {folder}")
         settings = load_preset(options.preset, overrides)

@@ -1,4 +1,5 @@
-"""The paper's network (§3.3, Fig. 2): a PointNet encoder, a decoder, one displacement out.
+"""The network: the paper's (§3.3, Fig. 2), a PointNet encoder and a decoder that answers with one displacement, and the
+adaptive one, whose decoder answers for several query points of a patch, with expected errors and a normal for each.
 
 Linear layers on rows of points rather than Conv1d: the same function, and the layout of the patches as they come.
 """
@@ -8,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+CONTEXT = 5  # inputs of the decoder beside the features: the query's place (3), points in the ball, a later pass or not
+ANSWERS = 8  # displacement (3), two logarithms of errors, normal (3)
 GATHERED_VALUES = 2**20  # how much the pooled layer's backward gathers at once: what the caches hold
 
 
@@ -21,18 +24,38 @@ GATHERED_VALUES = 2**20  # how much the pooled layer's backward gathers at once:
 class NetworkSettings:
     """Everything that decides the function of the network; saved in checkpoints and in model.json."""
 
-    encoder: tuple[int, ...] = (64, 128, 256, 512, 1024)
+    encoder: tuple[int, ...] = (64, 64, 128, 384)
     """Widths of the shared layers, from the coordinates up to the patch's feature vector."""
     decoder: tuple[int, ...] = (512, 256)
     """Widths of the layers between the feature vector and the displacement."""
-    norm_after_pool: bool = False
+    norm_after_pool: bool = True
     """The last encoder layer's BatchNorm and ReLU after the max instead of before it, as in the paper.
 
     The gradient then reaches one point a channel, and three quarters of the backward pass become a gather."""
+    adaptive: bool = True
+    """Answer for query points, with expected errors and normals, knowing the points in the ball and the pass."""
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkSettings:
-        return cls(tuple(values["encoder"]), tuple(values["decoder"]), bool(values["norm_after_pool"]))
+        return cls(
+            tuple(values["encoder"]),
+            tuple(values["decoder"]),
+            bool(values["norm_after_pool"]),
+            bool(values.get("adaptive", False)),
+        )
+
+
+class Answers(NamedTuple):
+    """What the network says of M query points, in the frames of their patches and in units of r.
+
+    displacements: (M, 3). log_moved, log_still: (M,), logarithms of the expected distance to the surface after the
+    displacement and without it. normals: (M, 3), of the surface at the moved point, of any sign and length.
+    """
+
+    displacements: Tensor
+    log_moved: Tensor
+    log_still: Tensor
+    normals: Tensor
 
 
 class _PooledLinear(torch.autograd.Function):
@@ -64,7 +87,7 @@ class _PooledLinear(torch.autograd.Function):
 
 
 class Pointfilter(nn.Module):
-    """Patches (B, N, 3) float32 in their frames, in units of r, to displacements (B, 3) float32 in the same units."""
+    """Patches (B, N, 3) float32 in their frames, in units of r, to answers for their query points."""
 
     def __init__(self, settings: NetworkSettings) -> None:
         super().__init__()
@@ -72,10 +95,10 @@ class Pointfilter(nn.Module):
         widths = (3, *settings.encoder)
         self.encoder = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
         self.encoder_norms = nn.ModuleList(nn.BatchNorm1d(width) for width in settings.encoder)
-        widths = (settings.encoder[-1], *settings.decoder)
+        widths = (settings.encoder[-1] + (CONTEXT if settings.adaptive else 0), *settings.decoder)
         self.decoder = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
         self.decoder_norms = nn.ModuleList(nn.BatchNorm1d(width) for width in settings.decoder)
-        self.head = nn.Linear(widths[-1], 3)
+        self.head = nn.Linear(widths[-1], ANSWERS if settings.adaptive else 3)
 
     def encoder_layers(self) -> list[tuple[nn.Linear, nn.BatchNorm1d]]:
         """Each shared layer with its normalisation."""
@@ -85,7 +108,8 @@ class Pointfilter(nn.Module):
         """Each decoder layer with its normalisation; `head` comes after them."""
         return _pairs(self.decoder, self.decoder_norms)
 
-    def forward(self, patches: Tensor) -> Tensor:
+    def encode(self, patches: Tensor) -> Tensor:
+        """The feature vectors (B, C) of patches (B, N, 3)."""
         batch, points, _ = patches.shape
         rows = patches.reshape(batch * points, 3)
         *inner, last = self.encoder_layers()
@@ -95,14 +119,53 @@ class Pointfilter(nn.Module):
         if self.settings.norm_after_pool:
             # The bias is the same for all points, so it commutes with the max.
             pooled: Tensor = _PooledLinear.apply(rows, layer.weight.to(rows.dtype), batch)  # type: ignore[no-untyped-call]
-            features = functional.relu(norm(pooled.float() + layer.bias))
-        else:
-            features = functional.relu(norm(layer(rows))).view(batch, points, -1).amax(dim=1)
-        for layer, norm in self.decoder_layers():
+            return functional.relu(norm(pooled.float() + layer.bias))
+        return functional.relu(norm(layer(rows))).view(batch, points, -1).amax(dim=1)
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """The paper's network: displacements (B, 3) of the centres."""
+        return torch.tanh(self._decode(self.encode(patches)))
+
+    def answer(self, patches: Tensor, queries: Tensor, owners: Tensor, context: Tensor) -> Answers:
+        """The adaptive network. queries: (M, 3), points of the patches `owners` (M,) int64 in their frames.
+        context: (B, 2), see `context`."""
+        values = self._decode(self.encode(patches), queries, owners, context)
+        return Answers(torch.tanh(values[:, :3]), values[:, 3], values[:, 4], values[:, 5:])
+
+    def _decode(
+        self,
+        features: Tensor,
+        queries: Tensor | None = None,
+        owners: Tensor | None = None,
+        context: Tensor | None = None,
+    ) -> Tensor:
+        (layer, norm), *others = self.decoder_layers()
+        if queries is None or owners is None or context is None:
+            features = layer(features)
+        else:  # what a patch's queries share is multiplied once
+            width = features.shape[1]
+            shared = functional.linear(torch.cat([features, context], dim=1), _without_queries(layer.weight, width))
+            features = shared[owners] + functional.linear(queries, layer.weight[:, width : width + 3], layer.bias)
+        features = functional.relu(norm(features))
+        for layer, norm in others:
             features = functional.relu(norm(layer(features)))
         with torch.autocast("cpu", enabled=False):
-            displacement: Tensor = torch.tanh(self.head(features.float()))
-        return displacement
+            values: Tensor = self.head(features.float())
+        return values
+
+
+def context(counts: Tensor, later: Tensor) -> Tensor:
+    """What the decoder is told of a patch beside its points: (B, 2) float32.
+
+    counts: (B,) points in its ball: a max over points cannot count. later: (B,) bool, whether the cloud has been
+    through a pass already.
+    """
+    return torch.stack([torch.log2(counts.float()) / 6 - 1, later.float()], dim=1)
+
+
+def _without_queries(weight: Tensor, width: int) -> Tensor:
+    """The columns of the first decoder layer's weight that see features and context, not the queries."""
+    return torch.cat([weight[:, :width], weight[:, width + 3 :]], dim=1)
 
 
 def _pairs(layers: nn.ModuleList, norms: nn.ModuleList) -> list[tuple[nn.Linear, nn.BatchNorm1d]]:

@@ -48,9 +48,10 @@ def _typed(key: str, old: Any, new: Any, source: str) -> Any:
     if isinstance(old, float) and type(new) is int:
         return float(new)
     if isinstance(old, tuple | list):
-        if isinstance(new, list) and new and all(type(entry) is type(old[0]) for entry in new):
+        kind = type(old[0]) if old else float
+        if isinstance(new, list) and new and all(type(entry) is kind for entry in new):
             return new
-        raise ValueError(f"{source}: {key} must be a list of {type(old[0]).__name__}, not {new!r}")
+        raise ValueError(f"{source}: {key} must be a list of {kind.__name__}, not {new!r}")
     if type(new) is not type(old):
         raise ValueError(f"{source}: {key} must be of type {type(old).__name__}, not {new!r}")
     return new

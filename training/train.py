@@ -17,16 +17,23 @@ import torch
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from tqdm import tqdm
 
-from pointfilter.filtering import filter_points
-from pointfilter.metrics import chamfer_distance
-from pointfilter.noise import NOISE_KINDS
-from training.dataset import DataSettings, TrainingCloud, batches_ahead, cut_batch, training_clouds, validation_cloud
-from training.grow import check_growth, grow
-from training.losses import LOSSES, LossSettings, filtering_loss
+from training.dataset import (
+    Batch,
+    DataSettings,
+    TrainingCloud,
+    batches_ahead,
+    clean_patches,
+    cut_batch,
+    nearest_on_surface,
+    training_clouds,
+    validation_cloud,
+)
+from training.losses import LOSSES, LossSettings, adaptive_loss, filtering_loss
 from training.network import NetworkSettings, Pointfilter
+from training.own import own_clouds
 
-CHECKPOINT_VERSION = 1
-GROWTH_PATCHES = 512  # on which a grown network's new units are measured
+CHECKPOINT_VERSION = 2
+CURVE = ("step", "loss", "distance", "validation_loss", "validation_distance")  # what a record keeps of the history
 
 OPTIMIZERS = ("adamw", "sgd")
 SCHEDULES = ("one-cycle", "exponential")
@@ -41,6 +48,8 @@ class TrainingSettings:
     data: DataSettings = field(default_factory=DataSettings)
     loss: LossSettings = field(default_factory=LossSettings)
     steps: int = 60_000
+    own_from: tuple[float, ...] = (0.25, 0.6)
+    """Shares of the run after which the network filters training clouds anew: later passes see its own outputs."""
     optimizer: str = "adamw"
     """adamw (default) or sgd (the paper's, §3.4)."""
     learning_rate: float = 2e-3
@@ -49,6 +58,7 @@ class TrainingSettings:
     final_learning_rate: float = 1e-8
     weight_decay: float = 1e-4
     gradient_clip: float = 1.0
+    """Largest norm of the gradient; 0: no limit."""
     ema_decay: float = 0.999
     """The weights that are exported are an exponential moving average; 0 exports the last ones."""
     precision: str = "auto"
@@ -67,18 +77,22 @@ class TrainingSettings:
             ("schedule", [self.schedule], SCHEDULES),
             ("precision", [self.precision], PRECISIONS),
             ("loss.loss", [self.loss.loss], LOSSES),
-            ("data.noise_kinds", self.data.noise_kinds, NOISE_KINDS),
         ):
             if not set(found) <= set(known):
                 raise ValueError(f"{name} must be one of {', '.join(known)}, not {', '.join(found)}")
+        if (self.loss.loss == "surface") != self.network.adaptive:
+            raise ValueError("the loss 'surface' and network.adaptive need each other")
+        if not self.network.adaptive and self.data.queries != 1:
+            raise ValueError("data.queries must be 1 for a network that is not adaptive")
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrainingSettings:
         values = dict(values)
-        data = dict(values["data"], noise_kinds=tuple(values["data"]["noise_kinds"]))
+        data = dict(values["data"], noise_levels=tuple(values["data"]["noise_levels"]))
         values["network"] = NetworkSettings.from_dict(values["network"])
         values["data"] = DataSettings(**data)
         values["loss"] = LossSettings(**values["loss"])
+        values["own_from"] = tuple(values["own_from"])
         return cls(**values)
 
 
@@ -98,7 +112,7 @@ class Run:
         self.step = 0
         self.seconds = 0.0
         self.history: list[dict[str, float]] = []
-        self.recent: list[float] = []
+        self.recent: list[tuple[float, float]] = []
         """Losses since the last row of the history."""
         self.before: list[dict[str, Any]] = []
         """Records of the runs that the first weights came from."""
@@ -108,6 +122,8 @@ class Run:
             self._load(folder / "checkpoint.pt")
         else:
             folder.mkdir(parents=True, exist_ok=True)
+            for left in folder.glob("own-*.npz"):  # by a run that ended before its first checkpoint
+                left.unlink()
             (folder / "settings.json").write_text(json.dumps(dataclasses.asdict(settings), indent=2) + "\n")
 
     def start_from(self, network: Pointfilter, before: list[dict[str, Any]]) -> None:
@@ -117,11 +133,10 @@ class Run:
         self.average.module.load_state_dict(network.state_dict())
 
     def _optimizer(self) -> torch.optim.Optimizer:
+        parameters, rate, decay = self.network.parameters(), self.settings.learning_rate, self.settings.weight_decay
         if self.settings.optimizer == "sgd":
-            return torch.optim.SGD(self.network.parameters(), self.settings.learning_rate, momentum=0.9)
-        return torch.optim.AdamW(
-            self.network.parameters(), self.settings.learning_rate, weight_decay=self.settings.weight_decay
-        )
+            return torch.optim.SGD(parameters, rate, momentum=0.9, weight_decay=decay)
+        return torch.optim.AdamW(parameters, rate, weight_decay=decay)
 
     def _scheduler(self) -> torch.optim.lr_scheduler.LRScheduler:
         settings = self.settings
@@ -178,43 +193,56 @@ class Run:
         """Trains to the last step, or stops (with a checkpoint) after step `until` or when stop() says so."""
         settings = self.settings
         last = settings.steps if until is None else min(until, settings.steps)
-        bfloat16 = _use_bfloat16(settings.precision)
         validation = [validation_cloud(number, settings.data) for number in range(settings.validation_clouds)]
         self.network.train()
+        progress = tqdm(initial=self.step, total=settings.steps, unit="batch", smoothing=0.05)
+        own_at = [round(share * settings.steps) for share in settings.own_from] if settings.network.adaptive else []
+        while self.step < last and not stop():
+            started = max((step for step in own_at if step <= self.step), default=None)
+            own = [] if started is None else self._own_clouds(started, clouds)
+            until_own = min([last, *(step for step in own_at if step > self.step)])
+            self._train([*clouds, *own], validation, until_own, progress, stop)
+        progress.close()
+        self.save()
+
+    def _train(
+        self,
+        clouds: list[TrainingCloud],
+        validation: list[TrainingCloud],
+        last: int,
+        progress: tqdm[Any],
+        stop: Callable[[], bool],
+    ) -> None:
+        settings = self.settings
+        bfloat16 = _use_bfloat16(settings.precision)
         started = time.perf_counter()
         spent = self.seconds
-        progress = tqdm(initial=self.step, total=settings.steps, unit="batch", smoothing=0.05)
         for batch in batches_ahead(clouds, settings.data, self.step, last):
             if stop():
                 break
             with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
-                displacements = self.network(batch.patches)
-            loss = filtering_loss(
-                displacements,
-                batch.clean,
-                batch.normals,
-                batch.present,
-                settings.loss,
-                progress=self.step / settings.steps,
-            ).mean()
+                loss, distance = self._loss(self.network, batch, clouds, self.step)
             self.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
-            torch.nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_clip)
+            if settings.gradient_clip:
+                torch.nn.utils.clip_grad_norm_(self.network.parameters(), settings.gradient_clip)
             self.optimizer.step()
             self.scheduler.step()
             self.average.update_parameters(self.network)
             self.step += 1
             self.seconds = spent + time.perf_counter() - started
-            self.recent.append(loss.item())
+            self.recent.append((loss.item(), distance))
             progress.update()
             if self.step % settings.validate_every == 0 or self.step == settings.steps:
+                losses = np.mean(self.recent, axis=0)
                 row: dict[str, float] = {
                     "step": self.step,
                     "patches": self.step * settings.data.batch,
                     "hours": round(self.seconds / 3600, 4),
                     "patches_per_second": round(self.step * settings.data.batch / self.seconds, 1),
                     "learning_rate": float(self.scheduler.get_last_lr()[0]),
-                    "loss": float(np.mean(self.recent)),
+                    "loss": float(losses[0]),
+                    "distance": float(losses[1]),
                     **self._validate(validation),
                 }
                 self.recent.clear()
@@ -222,48 +250,43 @@ class Run:
                 progress.write("  ".join(f"{name} {value:.6g}" for name, value in row.items()))
             if self.step % settings.checkpoint_every == 0:
                 self.save()
-        progress.close()
-        self.save()
+
+    def _loss(
+        self, network: Pointfilter, batch: Batch, clouds: list[TrainingCloud], step: int
+    ) -> tuple[torch.Tensor, float]:
+        """The mean loss of a batch, and the mean distance to the surface that is left, in units of the radius."""
+        settings = self.settings
+        if not network.settings.adaptive:
+            displacements = network(batch.patches)
+            near = clean_patches(batch, clouds, settings.data, step)
+            loss = filtering_loss(displacements, *near, settings.loss, progress=step / settings.steps)
+            return loss.mean(), loss.mean().item()
+        answers = network.answer(batch.patches, batch.queries, batch.owners, batch.context)
+        moved = batch.queries + answers.displacements
+        nearest, normals, spacing = nearest_on_surface(batch, clouds, moved)
+        loss, left = adaptive_loss(answers, nearest, normals, batch.still, batch.queries, spacing, settings.loss)
+        return loss.mean(), left.mean().item()
+
+    def _own_clouds(self, step: int, clouds: list[TrainingCloud]) -> list[TrainingCloud]:
+        """Pieces of the clouds, filtered by the network of this step."""
+        return own_clouds(self.folder / f"own-{step}.npz", clouds, self._trained(), self.settings.data)
+
+    def _trained(self) -> Pointfilter:
+        """The weights that are exported, not to be trained."""
+        average = cast("Pointfilter", self.average.module) if self.settings.ema_decay else self.network
+        network = Pointfilter(self.settings.network)
+        network.load_state_dict(average.state_dict())
+        return network.eval()
 
     def _validate(self, clouds: list[TrainingCloud]) -> dict[str, float]:
-        """The averaged network on shapes it never saw: its loss, and CD after one and two iterations."""
+        """The averaged network on shapes it never saw: its loss, and the distance that it leaves."""
         if not clouds:
             return {}
-        settings = self.settings
-        network = cast("Pointfilter", self.average.module) if settings.ema_decay else self.network
-        network.eval()
-        data = dataclasses.replace(settings.data, batch=256, clouds_per_batch=len(clouds), seed=settings.data.seed + 1)
+        data = dataclasses.replace(self.settings.data, batch=512, clouds_per_batch=4 * len(clouds), seed=2**31)
+        batch = cut_batch(clouds, data, 0)
         with torch.inference_mode():
-            batch = cut_batch(clouds, data, 0)
-            displacements = network(batch.patches)
-            loss = filtering_loss(displacements, batch.clean, batch.normals, batch.present, settings.loss).mean().item()
-        distances = []
-        for cloud in clouds:
-            row = [chamfer_distance(cloud.clean, cloud.points)]
-            for iterations in (1, 2):
-                filtered = filter_points(
-                    cloud.points,
-                    predictor(network),
-                    radius=cloud.index.radius,
-                    iterations=iterations,
-                    patch_points=settings.data.patch_points,
-                )
-                row.append(chamfer_distance(cloud.clean, filtered))
-            distances.append(row)
-        noisy, once, twice = (1e5 * np.mean(distances, axis=0)).tolist()
-        network.train(network is self.network)
-        return {"validation_loss": loss, "noisy_cd": noisy, "cd_1": once, "cd_2": twice}
-
-
-def predictor(network: Pointfilter) -> Any:
-    """The network as the plain callable that the core expects: (B, N, 3) float32 -> (B, 3) float32."""
-
-    def predict(patches: np.ndarray) -> np.ndarray:
-        with torch.inference_mode():
-            answer: np.ndarray = network(torch.from_numpy(patches)).numpy()
-            return answer
-
-    return predict
+            loss, distance = self._loss(self._trained(), batch, clouds, self.step)
+        return {"validation_loss": loss.item(), "validation_distance": distance}
 
 
 def trained_network(state: dict[str, Any]) -> Pointfilter:
@@ -278,26 +301,15 @@ def trained_network(state: dict[str, Any]) -> Pointfilter:
 
 
 def training_record(state: dict[str, Any]) -> dict[str, Any]:
-    """How the weights of a checkpoint came about, the runs that they started from included, the first one first.
-
-    Of bundles that filtered clouds for them only the names are told: where they lay is nobody's business.
-    """
+    """How the weights of a checkpoint came about, the runs that they started from included, the first one first."""
     return {
-        "settings": _without_folders(state["settings"]),
+        "settings": state["settings"],
         "steps": state["step"],
         "patches": state["step"] * state["settings"]["data"]["batch"],
         "hours": round(state["seconds"] / 3600, 3),
-        "curve": [
-            {key: row[key] for key in ("step", "loss", "validation_loss", "cd_1", "cd_2") if key in row}
-            for row in state["history"]
-        ],
-        "before": [{**record, "settings": _without_folders(record["settings"])} for record in state.get("before", [])],
+        "curve": [{key: row[key] for key in CURVE if key in row} for row in state["history"]],
+        "before": state.get("before", []),
     }
-
-
-def _without_folders(settings: dict[str, Any]) -> dict[str, Any]:
-    data = settings["data"]
-    return {**settings, "data": {**data, "filtered_by": Path(data.get("filtered_by", "")).name}}
 
 
 def _use_bfloat16(precision: str) -> bool:
@@ -319,9 +331,8 @@ def start(
 ) -> Run:
     """Starts or resumes a run and trains it to its end (or to step `until`, or until stop(), asked between batches).
 
-    init: the checkpoint where the weights come from; a narrower network grows into the one of the settings. Raises
-    ValueError where it cannot, FileExistsError where the folder holds another run, KeyboardInterrupt when stopped
-    before the first batch.
+    init: the checkpoint where the weights come from. Raises ValueError where its network has other settings,
+    FileExistsError where the folder holds another run, KeyboardInterrupt when stopped before the first batch.
     """
     first = None if init is None else trained_network(init)
     if resume:
@@ -332,7 +343,8 @@ def start(
     if first is not None:
         if resume:
             raise ValueError("weights to start from are for a new run; this one goes on from its own checkpoint")
-        check_growth(first.settings, settings.network)
+        if first.settings != settings.network:
+            raise ValueError(f"the weights to start from do not fit the network: {first.settings}, {settings.network}")
     run = Run(folder, settings, resume)
     if meshes or clouds or not resume:
         run.source = {name: str(path.absolute()) for name, path in (("meshes", meshes), ("clouds", clouds)) if path}
@@ -344,9 +356,6 @@ def start(
             raise KeyboardInterrupt
         pool.append(cloud)
     if init is not None and first is not None:
-        if first.settings != settings.network:
-            typical = cut_batch(pool, dataclasses.replace(settings.data, batch=GROWTH_PATCHES), 0).patches
-            first = grow(first, settings.network, typical)
         record = training_record(init)
         run.start_from(first, [*record.pop("before"), record])
     run.train(pool, until, stop)

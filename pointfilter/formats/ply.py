@@ -47,6 +47,13 @@ class PlySource:
     """(n, 3) byte positions of x, y and z, for binary vertices that hold lists."""
 
     @property
+    def single_precision(self) -> bool:
+        return any(
+            property.name in "xyz" and property.type in ("float", "float32")
+            for property in self.header.vertex.properties
+        )
+
+    @property
     def summary(self) -> dict[str, Any]:
         return {
             "format": "ply",

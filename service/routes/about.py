@@ -13,7 +13,7 @@ from starlette.responses import Response
 
 import pointfilter
 from pointfilter.errors import ModelError
-from pointfilter.models import Auto, ModelBundle
+from pointfilter.models import ModelBundle
 from service.dependencies import HouseDep
 from service.house import House
 from service.problems import answers
@@ -25,7 +25,7 @@ router = APIRouter(tags=["about"])
 
 
 class Model(BaseModel):
-    """A model bundle; radius is a share of the bounding box's diagonal."""
+    """A model bundle; without a calibration it runs in the paper's mode."""
 
     model_config = {"protected_namespaces": ()}
 
@@ -35,13 +35,12 @@ class Model(BaseModel):
     sha256: str
     opset: int
     patch_points: int
-    radius: float
-    iterations: int | Auto
     precision: str
     parameters: int
     network: dict[str, Any]
     training: dict[str, Any]
     scores: dict[str, Any]
+    calibration: dict[str, Any] | None
     provider: str | None
     """What evaluates it, while it is loaded."""
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,18 +10,27 @@ import torch
 
 from export import __main__ as command
 from export import bundle as bundle_module
+from export import calibration as calibration_module
 from export.bundle import ParityError, RoundingError, write_bundle
 from export.checkpoint import Loaded, load_checkpoint
 from pointfilter import Engine, load_bundle
+from training.dataset import Batch
 from training.network import NetworkSettings, Pointfilter
+from training.own import UNCALIBRATED
 from training.presets import load_preset
 from training.train import Run
 
 
-def loaded(seed: int = 0) -> Loaded:
+def loaded(seed: int = 0, adaptive: bool = False) -> Loaded:
     torch.manual_seed(seed)
-    network = Pointfilter(NetworkSettings((8, 16), (8,), norm_after_pool=True)).eval()
-    return Loaded(network, patch_points=32, radius=0.07, training={"steps": 5})
+    network = Pointfilter(NetworkSettings((8, 16), (8,), norm_after_pool=True, adaptive=adaptive)).eval()
+    return Loaded(network, patch_points=32, training={"steps": 5})
+
+
+@pytest.fixture(autouse=True)
+def small_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration_module, "CLOUDS", 2)
+    monkeypatch.setattr(calibration_module, "POINTS", (300,))
 
 
 @pytest.fixture
@@ -34,34 +44,56 @@ def checkpoint(tmp_path: Path) -> Path:
 
 def test_a_bundle_says_where_it_comes_from(tmp_path: Path) -> None:
     source = loaded()
-    bundle, error = write_bundle(source, tmp_path / "deep" / "mine", "1.2", iterations=3, scores={"cd": 1.0})
+    bundle, error = write_bundle(source, tmp_path / "deep" / "mine", "1.2", scores={"cd": 1.0})
     assert error <= bundle_module.PARITY_TOLERANCE
     assert bundle == load_bundle(tmp_path / "deep" / "mine")
-    assert (bundle.name, bundle.version, bundle.iterations) == ("mine", "1.2", 3)
-    assert (bundle.patch_points, bundle.radius) == (32, 0.07)
+    assert (bundle.name, bundle.version, bundle.patch_points) == ("mine", "1.2", 32)
+    assert bundle.calibration is None
     assert (bundle.training, bundle.scores) == ({"steps": 5}, {"cd": 1.0})
-    assert bundle.network == {"encoder": [8, 16], "decoder": [8], "norm_after_pool": True}
+    assert bundle.network == {"encoder": [8, 16], "decoder": [8], "norm_after_pool": True, "adaptive": False}
     assert bundle.parameters == sum(parameter.numel() for parameter in source.network.parameters())
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["mine"]
     Engine(bundle, "cpu").warm_up()
 
 
+def test_an_adaptive_bundle_has_a_calibration(tmp_path: Path) -> None:
+    bundle, _ = write_bundle(loaded(adaptive=True), tmp_path / "mine", "1")
+    calibration = bundle.calibration
+    assert calibration is not None
+    assert bundle.network["adaptive"] is True
+    assert calibration.balls == UNCALIBRATED.balls
+    assert calibration.preference in calibration_module.PREFERENCES
+    assert calibration.margin in calibration_module.MARGINS
+    assert json.loads((bundle.folder / "model.json").read_text())["calibration"] == calibration.as_dict()
+    Engine(bundle, "cpu").warm_up()
+
+
+def inputs() -> dict[str, np.ndarray]:
+    """What an engine is asked: one query a patch, its centre."""
+    patches = np.random.default_rng(5).uniform(-1, 1, (100, 32, 3)).astype(np.float32)
+    told = np.zeros((100, 2), np.float32)
+    return {"patches": patches, "context": told, "queries": np.zeros((100, 3), np.float32), "owners": np.arange(100)}
+
+
 @pytest.fixture
 def typical(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Patches for calibration without shapes to sample."""
+    """Patches for the ranges of int8 without shapes to sample."""
+    real = bundle_module.typical_batch
 
-    def patches(patch_points: int, step: int) -> np.ndarray:
-        return np.random.default_rng(step).uniform(-1, 1, (256, patch_points, 3)).astype(np.float32)
+    def batch(patch_points: int, step: int, patches: int = 256) -> Batch:
+        points = np.random.default_rng(step).uniform(-1, 1, (patches, patch_points, 3)).astype(np.float32)
+        some = real(patch_points, step, patches)
+        return dataclasses.replace(some, patches=torch.from_numpy(points))
 
-    monkeypatch.setattr(bundle_module, "typical_patches", patches)
+    monkeypatch.setattr(bundle_module, "typical_batch", batch)
 
 
-def test_an_int8_bundle_answers_nearly_the_same(tmp_path: Path, typical: None) -> None:
-    exact, _ = write_bundle(loaded(), tmp_path / "exact", "1")
-    rounded, _ = write_bundle(loaded(), tmp_path / "rounded", "1", int8=True)
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_an_int8_bundle_answers_nearly_the_same(adaptive: bool, tmp_path: Path, typical: None) -> None:
+    exact, _ = write_bundle(loaded(adaptive=adaptive), tmp_path / "exact", "1")
+    rounded, _ = write_bundle(loaded(adaptive=adaptive), tmp_path / "rounded", "1", int8=True)
     assert (exact.precision, rounded.precision) == ("float32", "int8")
-    patches = np.random.default_rng(5).uniform(-1, 1, (100, 32, 3)).astype(np.float32)
-    expected, answers = Engine(exact, "cpu")(patches), Engine(rounded, "cpu")(patches)
+    expected, answers = (Engine(bundle, "cpu")(**inputs()).displacements for bundle in (exact, rounded))
     told = json.loads((rounded.folder / "model.json").read_text())["rounding_error"]
     found = np.linalg.norm(answers - expected, axis=1).mean() / np.linalg.norm(expected, axis=1).mean()
     assert 0 < found < 0.05
@@ -79,7 +111,7 @@ def test_int8_that_changes_too_much_leaves_nothing_behind(
 
 
 def test_typical_patches_are_of_every_kind() -> None:
-    first, second = (bundle_module.typical_patches(48, step) for step in (0, 1))
+    first, second = (bundle_module.typical_batch(48, step).patches.numpy() for step in (0, 1))
     assert first.shape == second.shape == (bundle_module.CALIBRATION_PATCHES, 48, 3)
     assert (first != second).any()
     assert np.abs(first).max() <= 1
@@ -143,10 +175,10 @@ def test_a_folder_that_is_no_bundle_is_not_overwritten(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bundles", "diary", "file"]
 
 
-@pytest.mark.parametrize("iterations", [0, -1, 101])
-def test_iterations_out_of_range_write_nothing(iterations: int, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="iterations"):
-        write_bundle(loaded(), tmp_path / "mine", "1", iterations=iterations)
+@pytest.mark.parametrize("version", ["", "../1", "a b"])
+def test_a_version_that_is_no_name_writes_nothing(version: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="the version must be"):
+        write_bundle(loaded(), tmp_path / "mine", version)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -159,7 +191,8 @@ def test_the_command_exports_a_run(checkpoint: Path, tmp_path: Path, capsys: pyt
     arguments = [str(checkpoint), "--out", str(out), "--version", "7", "--scores", str(tmp_path / "scores.json")]
     assert command.main(arguments) == 0
     bundle = load_bundle(out)
-    assert (bundle.version, bundle.iterations, bundle.scores) == ("7", "auto", {"cd": 0.8})
+    assert (bundle.version, bundle.scores) == ("7", {"cd": 0.8})
+    assert bundle.calibration is not None
     assert bundle.training["settings"]["network"]["encoder"] == [8, 16]
     assert bundle.training["steps"] == 0
     assert f"{bundle.parameters} parameters" in capsys.readouterr().out
@@ -170,12 +203,16 @@ def test_the_average_is_exported_and_not_the_last_weights(checkpoint: Path) -> N
     for value in state["network"].values():
         value.zero_()
     torch.save(state, checkpoint)
-    patches = torch.randn(2, 9, 3)
-    averaged = load_checkpoint(checkpoint).network(patches)
-    assert averaged.abs().max() > 0
+
+    def answer() -> torch.Tensor:
+        torch.manual_seed(0)
+        given = torch.randn(2, 9, 3), torch.zeros(2, 3), torch.arange(2), torch.zeros(2, 2)
+        return load_checkpoint(checkpoint).network.answer(*given).displacements.detach()
+
+    assert answer().abs().max() > 0
     state["settings"]["ema_decay"] = 0.0
     torch.save(state, checkpoint)
-    np.testing.assert_array_equal(load_checkpoint(checkpoint).network(patches).detach(), 0)
+    np.testing.assert_array_equal(answer(), 0)
 
 
 @pytest.mark.parametrize(
@@ -183,7 +220,7 @@ def test_the_average_is_exported_and_not_the_last_weights(checkpoint: Path) -> N
     [
         ["missing.pt"],
         ["garbage.pt"],
-        ["good", "--iterations", "0"],
+        ["good", "--version", "../7"],
         ["good", "--scores", "garbage.pt"],
         ["good", "--scores", "missing.json"],
     ],

@@ -14,6 +14,7 @@ from torch.nn import functional
 from export.bundle import write_bundle
 from export.checkpoint import load_checkpoint
 from pointfilter import Engine
+from training.train import CHECKPOINT_VERSION
 
 WIDTHS = (3, 8, 12, 16, 24, 32)
 
@@ -76,12 +77,16 @@ def test_the_authors_checkpoints_answer_as_their_network_does(wrapped: bool, aut
     loaded = load_checkpoint(path)
     assert loaded.patch_points == 500
     bundle, _ = write_bundle(loaded, tmp_path / "authors", "0")
+    assert bundle.calibration is None  # the paper's mode
     engine = Engine(bundle, "cpu")
     for length in (1, 40, 500):
         patches = np.random.default_rng(length).uniform(-1, 1, (6, length, 3)).astype(np.float32)
         with torch.inference_mode():
             expected = authors(torch.from_numpy(patches.transpose(0, 2, 1).copy())).numpy()
-        np.testing.assert_allclose(engine(patches), expected, rtol=0, atol=1e-5)
+        none = np.zeros((6, 3), np.float32)
+        answer = engine(patches, none[:, :2], none, np.arange(6))
+        np.testing.assert_allclose(answer.displacements, expected, rtol=0, atol=1e-5)
+        assert answer.log_errors is None
 
 
 def test_a_checkpoint_of_the_authors_with_a_gap(authors: Authors, tmp_path: Path) -> None:
@@ -128,8 +133,9 @@ CONTENTS: dict[str, object] = {
     "no weights": {"state_dict": 7},
     "half of ours": {"settings": {}, "average": {}},
     "another version of ours": {"settings": {}, "average": {}, "version": 99},
-    "ours without its parts": {"settings": {}, "average": {}, "version": 1},
-    "ours of other types": {"settings": 5, "average": 5, "version": 1},
+    "an older version of ours": {"settings": {}, "average": {}, "version": 1},
+    "ours without its parts": {"settings": {}, "average": {}, "version": CHECKPOINT_VERSION},
+    "ours of other types": {"settings": 5, "average": 5, "version": CHECKPOINT_VERSION},
 }
 
 

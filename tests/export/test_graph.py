@@ -12,13 +12,23 @@ from export import graph
 from export.bundle import PARITY_TOLERANCE, parity_error
 from export.checkpoint import Loaded
 from export.graph import OPSET, build, encoder_ranges
+from pointfilter.engine import ADAPTIVE_INPUTS, ADAPTIVE_OUTPUTS
 from training.network import NetworkSettings, Pointfilter
 
 
 def network(norm_after_pool: bool, seed: int = 0) -> Pointfilter:
     """Random weights, running statistics off their defaults, and BatchNorm scales of both signs and near zero."""
     torch.manual_seed(seed)
-    made = Pointfilter(NetworkSettings((16, 24, 40), (24, 12), norm_after_pool))
+    return _unsettled(Pointfilter(NetworkSettings((16, 24, 40), (24, 12), norm_after_pool, adaptive=False)))
+
+
+def adaptive(norm_after_pool: bool, seed: int = 0) -> Pointfilter:
+    """The same, answering for queries."""
+    torch.manual_seed(seed)
+    return _unsettled(Pointfilter(NetworkSettings((16, 24, 40), (24, 12), norm_after_pool, adaptive=True)))
+
+
+def _unsettled(made: Pointfilter) -> Pointfilter:
     with torch.no_grad():
         for norm in [*made.encoder_norms, *made.decoder_norms]:
             norm.weight.normal_()
@@ -33,6 +43,79 @@ def answers(model: onnx.ModelProto, patches: np.ndarray) -> np.ndarray:
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
     (answer,) = session.run(None, {"patches": patches})
     return np.asarray(answer)
+
+
+def asked(batch: int, length: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Random inputs of an adaptive graph: no query for the first patch, several for the others, in any order."""
+    rng = np.random.default_rng(seed)
+    patches = rng.uniform(-1, 1, (batch, length, 3)).astype(np.float32)
+    owners = rng.permutation(np.repeat(np.arange(batch), np.append(0 if batch > 1 else 2, np.full(batch - 1, 3))))
+    told = np.stack([rng.uniform(-0.5, 1, batch), rng.integers(2, size=batch)], axis=1).astype(np.float32)
+    queries = rng.uniform(-0.45, 0.45, (len(owners), 3)).astype(np.float32)
+    return {"patches": patches, "context": told, "queries": queries, "owners": owners}
+
+
+def adaptive_answers(model: onnx.ModelProto, given: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    return dict(zip(ADAPTIVE_OUTPUTS, session.run(ADAPTIVE_OUTPUTS, given), strict=True))
+
+
+@pytest.mark.parametrize("norm_after_pool", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_onnxruntime_answers_for_queries_what_torch_answers(norm_after_pool: bool, seed: int) -> None:
+    made = adaptive(norm_after_pool, seed)
+    assert (made.encoder_norms[-1].weight < 0).any()
+    model = build(made)
+    for batch, length in [(1, 1), (2, 7), (64, 33), (3, 700)]:
+        given = asked(batch, length, seed)
+        with torch.inference_mode():
+            said = made.answer(*(torch.from_numpy(given[name]) for name in ("patches", "queries", "owners", "context")))
+        found = adaptive_answers(model, given)
+        errors = torch.stack([said.log_moved, said.log_still], dim=1)
+        for name, expected in zip(ADAPTIVE_OUTPUTS, (said.displacements, errors, said.normals), strict=True):
+            assert expected.abs().max() > 0.05
+            np.testing.assert_allclose(found[name], expected.numpy(), rtol=1e-5, atol=PARITY_TOLERANCE)
+
+
+def test_an_adaptive_graph_has_the_engine_s_inputs_and_outputs() -> None:
+    model = build(adaptive(norm_after_pool=True))
+    onnx.checker.check_model(model, full_check=True)
+    assert {entry.name for entry in model.graph.input} == ADAPTIVE_INPUTS
+    assert [entry.name for entry in model.graph.output] == ADAPTIVE_OUTPUTS
+    shapes = {
+        entry.name: [dimension.dim_param or dimension.dim_value for dimension in entry.type.tensor_type.shape.dim]
+        for entry in [*model.graph.input, *model.graph.output]
+    }
+    assert shapes == {
+        "patches": ["batch", "points", 3],
+        "context": ["batch", 2],
+        "queries": ["asked", 3],
+        "owners": ["asked"],
+        "displacements": ["asked", 3],
+        "log_errors": ["asked", 2],
+        "normals": ["asked", 3],
+    }
+    assert "BatchNormalization" not in [node.op_type for node in model.graph.node]
+
+
+@pytest.mark.parametrize("norm_after_pool", [False, True])
+def test_int8_answers_for_queries_nearly_the_same(norm_after_pool: bool) -> None:
+    made = adaptive(norm_after_pool)
+    given = asked(64, 33)
+    model = build(made, encoder_ranges(made, given["patches"]))
+    onnx.checker.check_model(model, full_check=True)
+    exact, rounded = adaptive_answers(build(made), given), adaptive_answers(model, given)
+    for name in ADAPTIVE_OUTPUTS:
+        change = np.linalg.norm(rounded[name] - exact[name], axis=1).mean()
+        assert 0 < change < 0.05 * np.linalg.norm(exact[name], axis=1).mean(), name
+    one = {
+        "patches": given["patches"][5:6],
+        "context": given["context"][5:6],
+        "queries": given["queries"][given["owners"] == 5],
+        "owners": np.zeros(3, np.int64),
+    }
+    for name, values in adaptive_answers(model, one).items():
+        np.testing.assert_allclose(values, rounded[name][given["owners"] == 5], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("norm_after_pool", [False, True])
@@ -124,12 +207,26 @@ def test_padding_and_order_change_nothing_in_the_exported_network() -> None:
     np.testing.assert_allclose(answers(model, patches[:, ::-1].copy()), answers(model, patches), atol=1e-6)
 
 
+@pytest.mark.parametrize("entry", range(8))
+def test_the_parity_check_sees_one_wrong_weight_of_any_answer(entry: int) -> None:
+    assert_seen(adaptive(norm_after_pool=True), entry, 0.01)
+
+
+def test_the_parity_check_sees_answers_that_are_no_numbers() -> None:
+    assert_seen(adaptive(norm_after_pool=True), 4, np.nan)
+
+
 def test_the_parity_check_sees_one_wrong_weight() -> None:
-    loaded = Loaded(network(norm_after_pool=True), patch_points=32, radius=0.05, training={})
+    assert_seen(network(norm_after_pool=True), 1, 0.01)
+
+
+def assert_seen(made: Pointfilter, entry: int, change: float) -> None:
+    """That one bias of the last layer, `change` off, is more than the parity check lets through."""
+    loaded = Loaded(made, patch_points=32, training={})
     model = build(loaded.network)
     assert parity_error(loaded, model.SerializeToString()) <= PARITY_TOLERANCE
     bias = next(weight for weight in model.graph.initializer if weight.name == "head_bias")
     values = onnx.numpy_helper.to_array(bias).copy()
-    values[1] += 0.01
+    values[entry] += change
     bias.CopyFrom(onnx.numpy_helper.from_array(values, "head_bias"))
-    assert parity_error(loaded, model.SerializeToString()) > PARITY_TOLERANCE
+    assert not parity_error(loaded, model.SerializeToString()) <= PARITY_TOLERANCE

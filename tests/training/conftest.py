@@ -17,6 +17,10 @@ TINY = [
     "data.clean_patch_points=48",
     "data.batch=16",
     "data.clouds_per_batch=4",
+    "data.largest_ball=200",
+    "data.queries=4",
+    "data.own_points=300",
+    "own_from=[0.5]",
     "steps=12",
     "threads=1",
     'precision="float32"',
@@ -29,6 +33,12 @@ TINY = [
 @pytest.fixture(scope="session")
 def tiny() -> TrainingSettings:
     return load_preset("smoke", TINY)
+
+
+@pytest.fixture(scope="session")
+def tiny_paper() -> TrainingSettings:
+    """The same for the paper's network and loss."""
+    return load_preset("smoke", [*TINY, "network.adaptive=false", 'loss.loss="bilateral"', "data.queries=1"])
 
 
 @pytest.fixture(scope="session")

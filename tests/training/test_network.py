@@ -8,7 +8,8 @@ import torch
 from torch.nn import functional
 
 from training import network as network_module
-from training.network import NetworkSettings, Pointfilter, _PooledLinear
+from training.network import NetworkSettings, Pointfilter, _PooledLinear, context
+from training.presets import load_preset
 
 
 @pytest.mark.parametrize("gathered", [1, 2**20])
@@ -34,8 +35,8 @@ def test_the_pooled_layer_s_gradient_is_the_dense_one(gathered: int, monkeypatch
 @pytest.mark.parametrize("positive", [True, False])
 def test_the_norm_may_come_after_the_max_where_scales_are_positive(positive: bool) -> None:
     torch.manual_seed(0)
-    after = Pointfilter(NetworkSettings((16, 32), (8,), norm_after_pool=True))
-    before = Pointfilter(NetworkSettings((16, 32), (8,), norm_after_pool=False))
+    after = Pointfilter(NetworkSettings((16, 32), (8,), norm_after_pool=True, adaptive=False))
+    before = Pointfilter(NetworkSettings((16, 32), (8,), norm_after_pool=False, adaptive=False))
     with torch.no_grad():
         for norm in after.encoder_norms:
             norm.running_mean.normal_()
@@ -53,7 +54,7 @@ def test_the_norm_may_come_after_the_max_where_scales_are_positive(positive: boo
 @pytest.mark.parametrize("norm_after_pool", [True, False])
 def test_padding_and_order_do_not_matter(norm_after_pool: bool) -> None:
     torch.manual_seed(0)
-    network = Pointfilter(NetworkSettings((16, 32), (8,), norm_after_pool)).eval()
+    network = Pointfilter(NetworkSettings((16, 32), (8,), norm_after_pool, adaptive=False)).eval()
     patches = torch.randn(4, 20, 3)
     patches[:, 0] = 0
     with torch.inference_mode():
@@ -64,8 +65,8 @@ def test_padding_and_order_do_not_matter(norm_after_pool: bool) -> None:
     torch.testing.assert_close(shuffled, expected, rtol=0, atol=1e-6)
 
 
-def test_the_default_network_is_the_paper_s() -> None:
-    network = Pointfilter(NetworkSettings())
+def test_the_paper_s_network_has_the_paper_s_widths() -> None:
+    network = Pointfilter(load_preset("paper").network)
     assert [(layer.in_features, layer.out_features) for layer in network.encoder] == [
         (3, 64), (64, 128), (128, 256), (256, 512), (512, 1024),
     ]  # fmt: skip
@@ -76,6 +77,83 @@ def test_the_default_network_is_the_paper_s() -> None:
 
 
 def test_settings_survive_being_plain_values() -> None:
-    settings = NetworkSettings((4, 5), (6,), True)
+    settings = NetworkSettings((4, 5), (6,), True, True)
     assert NetworkSettings.from_dict(copy.deepcopy(vars(settings))) == settings
-    assert NetworkSettings.from_dict({"encoder": [4, 5], "decoder": [6], "norm_after_pool": True}) == settings
+    before = NetworkSettings.from_dict({"encoder": [4, 5], "decoder": [6], "norm_after_pool": True})
+    assert before == NetworkSettings((4, 5), (6,), True, adaptive=False)
+
+
+# --- the adaptive network ---
+
+
+def adaptive(norm_after_pool: bool = True, seed: int = 0) -> Pointfilter:
+    """Random weights, and running statistics off their defaults."""
+    torch.manual_seed(seed)
+    network = Pointfilter(NetworkSettings((16, 32), (48, 32), norm_after_pool, adaptive=True))
+    with torch.no_grad():
+        for norm in [*network.encoder_norms, *network.decoder_norms]:
+            norm.weight.normal_()
+            norm.bias.normal_()
+            norm.running_mean.normal_()
+            norm.running_var.uniform_(0.5, 2)
+    return network.eval()
+
+
+def asked() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Patches (4, 20, 3), queries (7, 3), owners (7,) and context (4, 2)."""
+    generator = torch.Generator().manual_seed(5)
+    patches = torch.rand(4, 20, 3, generator=generator) * 2 - 1
+    patches[:, 0] = 0
+    owners = torch.tensor([0, 1, 2, 3, 2, 0, 2])
+    queries = torch.cat([torch.zeros(4, 3), patches[[2, 0, 2], [3, 5, 7]]])
+    told = context(torch.tensor([20, 40, 300, 20]), torch.tensor([False, True, False, True]))
+    return patches, queries, owners, told
+
+
+@pytest.mark.parametrize("norm_after_pool", [True, False])
+def test_what_queries_share_is_what_they_would_have_each(norm_after_pool: bool) -> None:
+    """The decoder of the paper on [features, query, context], one row a query."""
+    network = adaptive(norm_after_pool)
+    patches, queries, owners, told = asked()
+    with torch.inference_mode():
+        found = network.answer(patches, queries, owners, told)
+        rows = patches
+        for layer, norm in network.encoder_layers():
+            rows = functional.linear(rows, layer.weight, layer.bias)
+            if not (norm_after_pool and norm is network.encoder_norms[-1]):
+                rows = functional.relu(norm(rows.flatten(0, 1)).view_as(rows))
+        features = rows.amax(dim=1)
+        if norm_after_pool:
+            features = functional.relu(network.encoder_norms[-1](features))
+        values = torch.cat([features[owners], queries, told[owners]], dim=1)
+        for layer, norm in network.decoder_layers():
+            values = functional.relu(norm(layer(values)))
+        values = network.head(values)
+    expected = (values[:, :3].tanh(), values[:, 3], values[:, 4], values[:, 5:])
+    for name, value, right in zip(found._fields, found, expected, strict=True):
+        torch.testing.assert_close(value, right, rtol=1e-5, atol=1e-5, msg=name)
+    assert found.displacements.shape == found.normals.shape == (7, 3)
+
+
+def test_the_answer_depends_on_query_pass_and_count() -> None:
+    network = adaptive()
+    patches, queries, owners, told = asked()
+    with torch.inference_mode():
+        expected = network.answer(patches, queries, owners, told)
+        for changed in (
+            (patches, queries + 0.1, owners, told),
+            (patches, queries, owners, told + torch.tensor([1.0, 0.0])),
+            (patches, queries, owners, torch.stack([told[:, 0], 1 - told[:, 1]], dim=1)),
+        ):
+            other = network.answer(*changed)
+            assert all((a - b).abs().max() > 1e-3 for a, b in zip(expected, other, strict=True))
+
+
+def test_a_query_s_answer_does_not_depend_on_the_others() -> None:
+    network = adaptive()
+    patches, queries, owners, told = asked()
+    with torch.inference_mode():
+        expected = network.answer(patches, queries, owners, told)
+        alone = network.answer(patches[2:3], queries[4:5], torch.tensor([0]), told[2:3])
+    for one, all_of_them in zip(alone, expected, strict=True):
+        torch.testing.assert_close(one[0], all_of_them[4], rtol=1e-5, atol=1e-5)

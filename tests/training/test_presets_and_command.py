@@ -32,7 +32,10 @@ def test_the_paper_s_preset_has_the_paper_s_numbers() -> None:
     assert (paper.optimizer, paper.schedule) == ("sgd", "exponential")
     assert (paper.learning_rate, paper.final_learning_rate) == (1e-4, 1e-8)
     assert (paper.data.fewest_points, paper.data.most_points, paper.data.clean_points) == (100_000,) * 3
-    assert (paper.data.noise_low, paper.data.noise_high, paper.data.noise_kinds) == (0.0, 0.025, ("gaussian",))
+    assert paper.data.noise_levels == (0.0, 0.0025, 0.005, 0.01, 0.015, 0.025)
+    assert paper.data.plain_share == 1
+    assert (paper.weight_decay, paper.gradient_clip, paper.ema_decay) == (0, 0, 0)
+    assert not paper.network.adaptive
     assert (paper.data.radius, paper.data.patch_points) == (0.05, 500)
     loss = paper.loss
     assert (loss.loss, loss.eta, loss.sigma_n_degrees, loss.sigma_p, loss.sigma_p_points) == (
@@ -53,12 +56,14 @@ def test_settings_can_be_changed_one_by_one() -> None:
             "steps=7",
             "loss.eta=0.5",
             "network.encoder=[4, 5]",
-            'data.noise_kinds=["uniform", "outliers"]',
+            "data.noise_levels=[0.01, 0.02]",
+            "own_from=[0.5]",
             "learning_rate=1",
         ],
     )
     assert (settings.steps, settings.loss.eta, settings.network.encoder) == (7, 0.5, (4, 5))
-    assert settings.data.noise_kinds == ("uniform", "outliers")
+    assert settings.data.noise_levels == (0.01, 0.02)
+    assert settings.own_from == (0.5,)
     assert settings.learning_rate == 1.0
     assert settings.data.clouds == load_preset("smoke").data.clouds
 
@@ -79,8 +84,11 @@ WRONG = {
     'schedule="cosine"': "one-cycle",
     'precision="float64"': "bfloat16",
     'loss.loss="chamfer"': "bilateral",
-    'data.noise_kinds=["pink"]': "gaussian",
-    "data.noise_kinds=[]": "noise_kinds",
+    'data.noise_levels=["much"]': "noise_levels",
+    "data.noise_levels=[]": "noise_levels",
+    "own_from=0.5": "own_from",
+    'loss.loss="l2"': "need each other",
+    "network.adaptive=false": "need each other",
     'network.encoder=["wide"]': "encoder",
     "network.encoder=[]": "encoder",
     "network.encoder=7": "encoder",
@@ -93,12 +101,17 @@ def test_a_setting_that_there_is_not(override: str) -> None:
         load_preset("smoke", [override])
 
 
+def test_a_network_without_queries_is_asked_for_the_centre_alone() -> None:
+    with pytest.raises(ValueError, match=r"data\.queries must be 1"):
+        load_preset("smoke", ["network.adaptive=false", 'loss.loss="bilateral"'])
+
+
 def test_a_preset_that_there_is_not() -> None:
     with pytest.raises(ValueError, match="default, paper, smoke"):
         load_preset("grand")
 
 
-def test_a_checkpoint_of_an_older_run_still_has_settings() -> None:
+def test_settings_survive_being_plain_values() -> None:
     import dataclasses
 
     settings = load_preset("smoke")
@@ -121,6 +134,19 @@ def test_the_command_trains_stops_and_goes_on(tmp_path: Path, capsys: pytest.Cap
     assert command.main(["--out", str(tmp_path / "run"), "--resume"]) == 0
     assert "12 steps" in capsys.readouterr().out
     assert train(tmp_path / "other", "--init", tmp_path / "run" / "checkpoint.pt", "--until", 1) == 0
+
+
+@pytest.mark.parametrize("change", [["--set", "steps=20"], ["--seed", "1"]], ids=" ".join)
+def test_a_run_that_goes_on_takes_no_other_settings(
+    change: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(tmp_path / "run", "--until", 1) == 0
+    capsys.readouterr()
+    assert command.main(["--out", str(tmp_path / "run"), "--resume", *change]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: --resume takes its settings from the checkpoint")
+    assert error.count("\n") == 1
+    assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["step"] == 1
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -182,7 +208,10 @@ def test_the_command_says_what_is_wrong(
     Path("garbage.pt").write_bytes(b"garbage")
     torch.save({}, "empty.pt")
     torch.save({"network": {"layer.weight": torch.zeros(3)}}, "other.pt")
-    assert train(tmp_path / "run", *arguments) == 2
+    if arguments == ["--resume"]:
+        assert command.main(["--out", str(tmp_path / "run"), *arguments]) == 2
+    else:
+        assert train(tmp_path / "run", *arguments) == 2
     errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(errors) == 1
 

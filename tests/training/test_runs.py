@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 import torch
 
+from pointfilter.network import context
+from training import own as own_module
 from training import train as train_module
-from training.dataset import Batch, TrainingCloud
-from training.losses import filtering_loss
-from training.train import Run, TrainingSettings, predictor, start, training_record
+from training.dataset import Batch, TrainingCloud, cut_batch, training_clouds
+from training.network import NetworkSettings
+from training.own import as_network, own_clouds
+from training.train import Run, TrainingSettings, start, training_record
 
 
 def weights(run: Run) -> dict[str, torch.Tensor]:
@@ -34,6 +37,12 @@ def assert_same(a: Run, b: Run) -> None:
     assert [row["loss"] for row in a.history] == [row["loss"] for row in b.history]
 
 
+@pytest.fixture(autouse=True)
+def moving(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A network that has hardly been trained moves nothing where it may stay."""
+    monkeypatch.setattr(own_module, "UNCALIBRATED", dataclasses.replace(own_module.UNCALIBRATED, margin=-100.0))
+
+
 @pytest.fixture
 def straight(tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]) -> Run:
     run = Run(tmp_path / "straight", tiny, resume=False)
@@ -41,7 +50,7 @@ def straight(tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]
     return run
 
 
-@pytest.mark.parametrize("until", [1, 5, 8])
+@pytest.mark.parametrize("until", [1, 5, 6, 8])  # own clouds are made at step 6
 def test_a_run_that_was_stopped_goes_on_exactly(
     until: int, straight: Run, tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]
 ) -> None:
@@ -54,15 +63,22 @@ def test_a_run_that_was_stopped_goes_on_exactly(
     assert_same(straight, second)
 
 
+@pytest.mark.parametrize(("killed_at", "goes_on_from"), [(5, 4), (7, 4), (10, 8)])
 def test_a_run_that_was_killed_goes_on_from_its_checkpoint_exactly(
-    straight: Run, tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud], monkeypatch: pytest.MonkeyPatch
+    killed_at: int,
+    goes_on_from: int,
+    straight: Run,
+    tmp_path: Path,
+    tiny: TrainingSettings,
+    clouds: list[TrainingCloud],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with monkeypatch.context() as patch:
         real = train_module.batches_ahead
 
-        def killed(*arguments: Any) -> Iterator[Batch]:
-            for number, batch in enumerate(real(*arguments)):
-                if number == 7:
+        def killed(clouds: Any, data: Any, first: int, last: int) -> Iterator[Batch]:
+            for step, batch in enumerate(real(clouds, data, first, last), first):
+                if step == killed_at:
                     raise KeyboardInterrupt
                 yield batch
 
@@ -70,7 +86,7 @@ def test_a_run_that_was_killed_goes_on_from_its_checkpoint_exactly(
         with pytest.raises(KeyboardInterrupt):
             Run(tmp_path / "killed", tiny, resume=False).train(clouds)
     second = Run(tmp_path / "killed", tiny, resume=True)
-    assert second.step == 4
+    assert second.step == goes_on_from
     second.train(clouds)
     assert_same(straight, second)
 
@@ -122,13 +138,15 @@ def test_a_kill_while_saving_leaves_the_checkpoint_before(
 def test_a_run_writes_its_curve_and_its_settings(straight: Run) -> None:
     with (straight.folder / "log.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ["step", "patches", "hours", "patches_per_second", "learning_rate", "loss"]
+    names = ["step", "patches", "hours", "patches_per_second", "learning_rate", "loss", "distance"]
+    assert list(rows[0]) == names
     assert [int(row["step"]) for row in rows] == [4, 8, 12]
     assert [int(row["patches"]) for row in rows] == [64, 128, 192]
     assert all(np.isfinite(float(value)) for row in rows for value in row.values())
     described = json.loads((straight.folder / "settings.json").read_text())
     assert TrainingSettings.from_dict(described) == straight.settings
-    assert sorted(path.name for path in straight.folder.iterdir()) == ["checkpoint.pt", "log.csv", "settings.json"]
+    files = sorted(path.name for path in straight.folder.iterdir())
+    assert files == ["checkpoint.pt", "log.csv", "own-6.npz", "settings.json"]
 
 
 def test_validation_is_in_the_curve(tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]) -> None:
@@ -136,35 +154,156 @@ def test_validation_is_in_the_curve(tmp_path: Path, tiny: TrainingSettings, clou
     run = Run(tmp_path, settings, resume=False)
     run.train(clouds)
     (row,) = run.history
-    assert list(row)[-4:] == ["validation_loss", "noisy_cd", "cd_1", "cd_2"]
-    assert all(np.isfinite(value) and value > 0 for value in list(row.values())[-4:])
+    assert list(row)[-2:] == ["validation_loss", "validation_distance"]
+    assert np.isfinite(row["validation_loss"])
+    assert 0 < row["validation_distance"] < 1
     assert run.network.training
+    assert training_record(checkpoint(run))["curve"] == [{name: row[name] for name in train_module.CURVE}]
+
+
+def test_validation_s_loss_is_that_of_the_run_s_progress(
+    tmp_path: Path, tiny_paper: TrainingSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = dataclasses.replace(tiny_paper, steps=4, validate_every=2, validation_clouds=1)
+    seen: list[float] = []
+    real = train_module.filtering_loss
+
+    def loss(*arguments: Any, progress: float) -> torch.Tensor:
+        if len(arguments[0]) == 512:  # the validation's batch
+            seen.append(progress)
+        return real(*arguments, progress=progress)
+
+    monkeypatch.setattr(train_module, "filtering_loss", loss)
+    Run(tmp_path, settings, resume=False).train(list(training_clouds(settings.data)))
+    assert seen == [0.5, 1.0]
 
 
 @pytest.mark.parametrize("optimizer", ["adamw", "sgd"])
 @pytest.mark.parametrize("norm_after_pool", [True, False])
+@pytest.mark.parametrize("adaptive", [True, False])
 def test_training_lowers_the_loss(
-    optimizer: str, norm_after_pool: bool, tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]
+    optimizer: str,
+    norm_after_pool: bool,
+    adaptive: bool,
+    tmp_path: Path,
+    tiny: TrainingSettings,
+    tiny_paper: TrainingSettings,
+    clouds: list[TrainingCloud],
 ) -> None:
-    network = dataclasses.replace(tiny.network, norm_after_pool=norm_after_pool)
-    rate = 2e-2 if optimizer == "sgd" else 1e-2
+    settings = tiny if adaptive else tiny_paper
     settings = dataclasses.replace(
-        tiny, network=network, optimizer=optimizer, learning_rate=rate, steps=150, ema_decay=0.0, weight_decay=0.0
+        settings,
+        network=dataclasses.replace(settings.network, norm_after_pool=norm_after_pool),
+        optimizer=optimizer,
+        learning_rate=2e-2 if optimizer == "sgd" else 1e-2,
+        steps=150,
+        ema_decay=0.0,
+        weight_decay=0.0,
+        validate_every=10**6,
+        checkpoint_every=10**6,
+        own_from=(2.0,),  # never
     )
-    settings = dataclasses.replace(settings, validate_every=10**6, checkpoint_every=10**6)
     run = Run(tmp_path, settings, resume=False)
-    data = dataclasses.replace(settings.data, batch=128)
+    batch = cut_batch(clouds, dataclasses.replace(settings.data, batch=128), 10**6)
 
     def loss() -> float:
-        batch = train_module.cut_batch(clouds, data, 10**6)
         run.network.train()
         with torch.no_grad():
-            answers = run.network(batch.patches)
-        return filtering_loss(answers, batch.clean, batch.normals, batch.present, settings.loss).mean().item()
+            return run._loss(run.network, batch, clouds, 0)[0].item()
 
     before = loss()
     run.train(clouds)
-    assert loss() < 0.8 * before
+    assert loss() < before - 0.2 * abs(before)
+
+
+@pytest.mark.parametrize("optimizer", ["adamw", "sgd"])
+def test_weight_decay_reaches_the_optimizer(optimizer: str, tmp_path: Path, tiny: TrainingSettings) -> None:
+    settings = dataclasses.replace(tiny, optimizer=optimizer, weight_decay=0.125)
+    run = Run(tmp_path, settings, resume=False)
+    assert [group["weight_decay"] for group in run.optimizer.param_groups] == [0.125]
+
+
+@pytest.mark.parametrize(("limit", "calls"), [(0.0, []), (0.5, [0.5, 0.5])])
+def test_gradients_are_clipped_where_there_is_a_limit(
+    limit: float,
+    calls: list[float],
+    tmp_path: Path,
+    tiny: TrainingSettings,
+    clouds: list[TrainingCloud],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[float] = []
+    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", lambda _, largest: seen.append(largest))
+    Run(tmp_path, dataclasses.replace(tiny, gradient_clip=limit), resume=False).train(clouds, 2)
+    assert seen == calls
+
+
+# --- clouds that the network has filtered ---
+
+
+def test_own_clouds_are_saved_and_come_from_the_file(
+    tmp_path: Path, straight: Run, tiny: TrainingSettings, clouds: list[TrainingCloud]
+) -> None:
+    network = straight._trained()
+    settings = dataclasses.replace(tiny.data, own_every=1, own_points=200)
+    made = own_clouds(tmp_path / "own.npz", clouds, network, settings)
+    assert [path.name for path in tmp_path.glob("own*")] == ["own.npz"]
+    for own, cloud in zip(made, clouds, strict=True):
+        assert own.later
+        assert own.points.shape == (200, 3)
+        assert own.clean is cloud.clean
+        assert own.radius == cloud.radius
+        stayed = (own.points[:, None] == cloud.points[None]).all(axis=2).any(axis=1)
+        assert stayed.mean() < 0.1
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.zero_()
+    again = own_clouds(tmp_path / "own.npz", clouds, network, settings)
+    anew = own_clouds(tmp_path / "new.npz", clouds, network, settings)
+    for first, second in zip(made, again, strict=True):
+        np.testing.assert_array_equal(first.points, second.points)
+    assert any((first.points != third.points).any() for first, third in zip(made, anew, strict=True))
+
+
+def test_own_clouds_are_a_share_of_the_clouds(
+    tmp_path: Path, straight: Run, tiny: TrainingSettings, clouds: list[TrainingCloud]
+) -> None:
+    settings = dataclasses.replace(tiny.data, own_every=2, own_points=100)
+    made = own_clouds(tmp_path / "own.npz", [*clouds, *clouds, clouds[1]], straight._trained(), settings)
+    assert [own.clean for own in made] == [clouds[0].clean, clouds[0].clean, clouds[1].clean]
+
+
+def test_own_clouds_keep_a_fixed_radius(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
+    settings = dataclasses.replace(tiny.data, radius=0.2, own_points=100)
+    (own,) = own_clouds(tmp_path / "own.npz", list(training_clouds(settings)), straight._trained(), settings)
+    assert own.radius == pytest.approx(0.2, rel=0.05)
+
+
+def test_a_run_trains_on_its_own_clouds_as_later_ones(
+    tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    later: list[bool] = []
+    real = train_module.batches_ahead
+
+    def watched(*arguments: Any) -> Iterator[Batch]:
+        for batch in real(*arguments):
+            later.append(bool(batch.context[:, 1].any()))
+            yield batch
+
+    monkeypatch.setattr(train_module, "batches_ahead", watched)
+    settings = dataclasses.replace(tiny, data=dataclasses.replace(tiny.data, own_share=1.0))
+    Run(tmp_path, settings, resume=False).train(clouds)
+    assert later == [False] * 6 + [True] * 6
+
+
+def test_a_new_run_takes_no_own_clouds_of_another(
+    tmp_path: Path, straight: Run, tiny: TrainingSettings, clouds: list[TrainingCloud]
+) -> None:
+    """A run that was killed before its first checkpoint leaves its folder to the next one."""
+    np.savez(tmp_path / "own-6.npz", **{"0": np.random.default_rng(0).normal(size=(300, 3))})
+    run = Run(tmp_path, tiny, resume=False)
+    run.train(clouds)
+    assert_same(straight, run)
 
 
 def checkpoint(run: Run) -> dict[str, object]:
@@ -184,23 +323,11 @@ def test_weights_may_be_taken_over(tmp_path: Path, straight: Run, tiny: Training
     assert Run(third.folder, tiny, resume=True).before == third.before
 
 
-def test_a_record_names_no_folder(straight: Run) -> None:
-    state = checkpoint(straight)
-    state["settings"]["data"]["filtered_by"] = str(Path("my", "private", "bundle"))
-    assert training_record(state)["settings"]["data"]["filtered_by"] == "bundle"
-    assert state["settings"]["data"]["filtered_by"] == str(Path("my", "private", "bundle"))
-    state["before"] = [{"settings": {"data": {"filtered_by": str(Path("my", "older", "one"))}}}]
-    (ancestor,) = training_record(state)["before"]
-    assert ancestor["settings"]["data"]["filtered_by"] == "one"
-
-
-def test_a_narrower_network_grows(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
-    widths = [2 * width for width in tiny.network.encoder]
-    wider = dataclasses.replace(tiny, network=dataclasses.replace(tiny.network, encoder=(*widths[:1], *widths)))
-    run = start(tmp_path / "new", wider, init=checkpoint(straight), until=0)
-    patches = torch.randn(8, 20, 3)
-    with torch.inference_mode():
-        np.testing.assert_allclose(run.network.eval()(patches), straight.average.module.eval()(patches), atol=1e-5)
+def test_weights_of_another_network_are_refused(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
+    wider = dataclasses.replace(tiny, network=dataclasses.replace(tiny.network, encoder=(16, 32)))
+    with pytest.raises(ValueError, match="do not fit"):
+        start(tmp_path / "new", wider, init=checkpoint(straight))
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_run_that_goes_on_takes_no_other_weights(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
@@ -230,7 +357,26 @@ def test_the_paper_s_schedule_ends_where_the_paper_says(
 
 
 def test_a_network_is_a_plain_callable(straight: Run) -> None:
-    straight.network.eval()
-    answer = predictor(straight.network)(np.zeros((4, 9, 3), np.float32))
-    assert answer.shape == (4, 3)
-    assert answer.dtype == np.float32
+    network = straight._trained()
+    rng = np.random.default_rng(0)
+    patches = rng.uniform(-1, 1, (4, 9, 3)).astype(np.float32)
+    queries, owners = patches[[0, 1, 1, 3], 2], np.array([0, 1, 1, 3])
+    told = context(np.array([9, 20, 30, 9]), later=True)
+    found = as_network(network)(patches, told, queries, owners)
+    expected = network.answer(*map(torch.from_numpy, (patches, queries, owners, told)))
+    assert found.log_errors is not None
+    np.testing.assert_array_equal(found.displacements, expected.displacements.detach())
+    np.testing.assert_array_equal(found.log_errors[:, 0], expected.log_moved.detach())
+    np.testing.assert_array_equal(found.log_errors[:, 1], expected.log_still.detach())
+    np.testing.assert_array_equal(found.normals, expected.normals.detach())
+
+
+def test_the_paper_s_network_is_one_too(tmp_path: Path, tiny_paper: TrainingSettings) -> None:
+    network = Run(tmp_path, tiny_paper, resume=False)._trained()
+    assert network.settings == NetworkSettings((8, 16), (8,), adaptive=False)
+    patches = np.random.default_rng(0).uniform(-1, 1, (4, 9, 3)).astype(np.float32)
+    none = np.zeros((4, 3), np.float32)
+    found = as_network(network)(patches, none[:, :2], none, np.arange(4))
+    np.testing.assert_array_equal(found.displacements, network(torch.from_numpy(patches)).detach())
+    assert found.log_errors is None
+    assert found.normals is None

@@ -7,9 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pointfilter import Engine, filtering, prediction
-from pointfilter.filtering import filter_points
-from tests.clouds import crease, pooled, rotation
+from pointfilter import Engine
+from pointfilter import network as network_module
+from pointfilter.adaptive.calibration import Calibration
+from tests.clouds import adaptive_pooled, crease, filter_points, pooled, rotation
+
+CALIBRATION = Calibration(
+    balls=(8, 16, 32, 64), preference=0.0, margin=0.0, passes=3, query_reach=0.4, error_factor=1.0
+)
 
 clouds = st.tuples(st.integers(0, 2**32), st.integers(30, 250), st.sampled_from(["ball", "sheet", "crease"]))
 
@@ -66,10 +71,10 @@ def test_a_dense_cloud_turns_too(seed: int) -> None:
 
 def test_both_sides_of_the_downsampling_are_exercised() -> None:
     """The clouds above have balls with fewer and with more neighbours than the patches have places."""
-    from pointfilter.patches import NeighbourIndex, stable_ids
+    from pointfilter.patches import NeighbourIndex
 
     points = cloud_of((0, 200, "sheet"))
-    counts = NeighbourIndex(points, 0.45, stable_ids(points)).count(points)
+    counts = NeighbourIndex(points, 0.45).patches(np.arange(200), np.full(200, 0.45), 1, 0).counts
     assert counts.min() < 12 < counts.max() < 500
 
 
@@ -90,7 +95,7 @@ def test_batches_and_threads_change_no_bit(
     rows: int, threads: int, patch_points: int, noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = filter_points(noisy_crease, pooled, radius=0.15, patch_points=patch_points)
-    monkeypatch.setattr(prediction, "ROWS_PER_BATCH", rows)
+    monkeypatch.setattr(network_module, "ROWS_PER_BATCH", rows)
     found = filter_points(noisy_crease, pooled, radius=0.15, patch_points=patch_points, threads=threads)
     np.testing.assert_array_equal(found, expected)
 
@@ -98,12 +103,9 @@ def test_batches_and_threads_change_no_bit(
 def test_the_length_that_patches_are_padded_to_changes_no_bit(
     noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    buckets = filtering.length_buckets
     results = []
     for step in (1, 7, 32, 300):
-        monkeypatch.setattr(
-            filtering, "length_buckets", lambda counts, longest, step=step: buckets(counts, longest, step)
-        )
+        monkeypatch.setattr(network_module, "LENGTH_STEP", step)
         results.append(filter_points(noisy_crease, pooled, radius=0.15, patch_points=300))
     for result in results[1:]:
         np.testing.assert_array_equal(result, results[0])
@@ -124,6 +126,48 @@ def test_the_seed_decides_where_there_is_a_choice_and_only_there(noisy_crease: n
     np.testing.assert_array_equal(filtered(1, 600), filtered(2, 600))
 
 
+# --- the adaptive mode ---
+
+
+def adapted(points: np.ndarray, **options: object) -> np.ndarray:
+    return filter_points(points, adaptive_pooled, calibration=CALIBRATION, patch_points=24, **options)
+
+
+@given(drawn=clouds, similarity=st.integers(0, 2**32), scale=st.floats(1e-3, 1e3), reach=st.floats(0, 100))
+def test_the_adaptive_mode_turns_moves_and_scales_too(
+    drawn: tuple[int, int, str], similarity: int, scale: float, reach: float
+) -> None:
+    points = cloud_of(drawn)
+    rng = np.random.default_rng(similarity)
+    turn, shift = rotation(rng), reach * rng.normal(size=3)
+    moved = adapted(scale * (points @ turn.T + shift)) / scale
+    np.testing.assert_allclose((moved - shift) @ turn, adapted(points), atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["ball", "sheet", "crease"])
+def test_row_order_threads_and_batches_change_no_bit_of_the_adaptive_mode(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = cloud_of((3, 3_000, kind))
+    expected = adapted(points)
+    assert (expected != points).any(axis=1).mean() > 0.5
+    shuffle = np.random.default_rng(0).permutation(len(points))
+    np.testing.assert_array_equal(adapted(points[shuffle], threads=3), expected[shuffle])
+    monkeypatch.setattr(network_module, "ROWS_PER_BATCH", 100)
+    np.testing.assert_array_equal(adapted(points), expected)
+
+
+def test_a_piece_with_a_margin_gives_the_same_bits_as_the_whole() -> None:
+    """Every choice is local: what lies further away than some balls has no influence."""
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(0, 20, 8_000), rng.uniform(0, 2, 8_000), 0.02 * rng.normal(size=8_000)])
+    whole = adapted(points, origin=np.zeros(3))
+    piece = points[:, 0] < 14
+    inside = points[piece][:, 0] < 6
+    assert (whole != points).any(axis=1).mean() > 0.5
+    np.testing.assert_array_equal(adapted(points[piece], origin=np.zeros(3))[inside], whole[piece][inside])
+
+
 # --- with onnxruntime, whose products may add in another order for another batch ---
 
 ENGINE_TOLERANCE = 1e-6  # of the radius
@@ -137,7 +181,7 @@ def test_an_engine_answers_alike_in_any_batch(
         return filter_points(noisy_crease, engine, radius=0.15, iterations=1, patch_points=64, threads=threads)
 
     expected = filtered(1)
-    monkeypatch.setattr(prediction, "ROWS_PER_BATCH", rows)
+    monkeypatch.setattr(network_module, "ROWS_PER_BATCH", rows)
     np.testing.assert_allclose(filtered(threads), expected, rtol=0, atol=ENGINE_TOLERANCE * 0.15)
 
 

@@ -6,13 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pointfilter import _native
-from pointfilter.patches import NeighbourIndex, Patches, length_buckets, stable_ids
+from pointfilter.network import LENGTH_STEP, _by_length
+from pointfilter.patches import NeighbourIndex, Patches
 from tests.clouds import rotation
 
 
 def cut(points: np.ndarray, radius: float, length: int, key: int = 0) -> Patches:
-    ids = stable_ids(points)
-    return NeighbourIndex(points, radius, ids).patches(points, ids, length, key)
+    return NeighbourIndex(points, radius).patches(np.arange(len(points)), np.full(len(points), radius), length, key)
 
 
 def in_ball(points: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
@@ -120,26 +120,16 @@ def test_the_frame_sees_the_whole_ball_and_not_the_choice() -> None:
         assert set(map(tuple, patch.tolist())) <= set(map(tuple, every.tolist()))
 
 
-def test_a_patch_holds_the_rows_that_sample_names() -> None:
-    points = np.random.default_rng(3).normal(size=(150, 3))
-    ids = stable_ids(points)
-    index = NeighbourIndex(points, 1.5, ids)
-    patches = index.patches(points, ids, 16, 9)
-    rows, _ = index.sample(points, ids, 16, 9)
-    offsets = np.where(rows[..., None] >= 0, (points[rows] - points[:, None]) / 1.5, 0)
-    np.testing.assert_allclose(patches.points, offsets @ patches.frames.transpose(0, 2, 1), atol=1e-6)
-
-
 @given(
-    counts=st.lists(st.integers(0, 2000), max_size=80), longest=st.integers(1, 600), step=st.sampled_from([1, 32, 50])
+    counts=st.lists(st.integers(0, 2000), max_size=80), longest=st.integers(1, 600)
 )
-def test_buckets_hold_every_patch_once_at_a_length_that_fits(counts: list[int], longest: int, step: int) -> None:
+def test_every_patch_is_evaluated_once_at_a_length_that_fits(counts: list[int], longest: int) -> None:
     numbers = np.array(counts, dtype=np.int64)
     seen: list[int] = []
-    for length, positions in length_buckets(numbers, longest, step):
+    for length, positions in _by_length(numbers, longest):
         assert length <= longest
         assert (np.minimum(numbers[positions], longest) <= length).all()
-        assert (length - numbers[positions] < step).all() or length == longest
+        assert (length - numbers[positions] <= LENGTH_STEP).all() or length == longest
         seen += positions.tolist()
     assert sorted(seen) == list(range(len(counts)))
 
@@ -149,32 +139,24 @@ def test_buckets_hold_every_patch_once_at_a_length_that_fits(counts: list[int], 
 
 def test_buffers_that_do_not_fit_are_refused() -> None:
     points = np.random.default_rng(3).normal(size=(20, 3))
-    ids = stable_ids(points)
-    arrays = NeighbourIndex(points, 1.0, ids)._arrays
-    counts = np.empty(20, np.int64)
-    _native.count_neighbours(arrays, points, 1.0, 9, counts)
-    with pytest.raises(ValueError, match="centres"):
-        _native.count_neighbours(arrays, points[:5], 1.0, 9, counts)
-    with pytest.raises(TypeError, match="centres"):
-        _native.count_neighbours(arrays, points.astype(np.float32), 1.0, 9, counts)
+    arrays = NeighbourIndex(points, 1.0)._arrays
+    rows, radii, owners = np.arange(20), np.ones(20), np.empty(20, np.int64)
+    keys = np.arange(20, dtype=np.uint64)
+    _native.smallest_key(arrays, rows, radii, keys, owners)
+    with pytest.raises(ValueError, match="radii"):
+        _native.smallest_key(arrays, rows, radii[:5], keys, owners)
+    with pytest.raises(TypeError, match="radii"):
+        _native.smallest_key(arrays, rows, radii.astype(np.float32), keys, owners)
+    with pytest.raises(ValueError, match="beyond"):
+        _native.smallest_key(arrays, rows + 1, radii, keys, owners)
+    with pytest.raises(ValueError, match="keys"):
+        _native.smallest_key(arrays, rows, radii, keys[:5].copy(), owners)
     with pytest.raises(ValueError, match="frames"):
-        _native.build_patches(
-            arrays, points, ids, 1.0, 0, np.empty((20, 4, 3), np.float32), np.empty((19, 3, 3)), counts
-        )
-    with pytest.raises(ValueError, match="indices"):
-        _native.sample_neighbours(arrays, points, ids, 1.0, 0, np.empty(21, np.int64), counts)
-    with pytest.raises(ValueError, match=r"ids|points"):
-        _native.count_neighbours((arrays[0], ids[:5].copy(), *arrays[2:]), points, 1.0, 9, counts)
-    counts.setflags(write=False)
+        _native.build_patches(arrays, rows, radii, 0, np.empty((20, 4, 3), np.float32), np.empty((19, 3, 3)), owners)
+    with pytest.raises(ValueError, match="radii"):
+        _native.ball_radii(arrays, rows, radii, np.ones((20, 2), np.int64), np.empty((20, 3)))
+    with pytest.raises(ValueError, match=r"cell_starts|index"):
+        _native.smallest_key((arrays[0], arrays[1], arrays[2][:-1].copy(), *arrays[3:]), rows, radii, keys, owners)
+    owners.setflags(write=False)
     with pytest.raises(ValueError, match="read-only"):
-        _native.count_neighbours(arrays, points, 1.0, 9, counts)
-
-
-def test_copies_of_the_centre_do_not_crowd_out_its_neighbours() -> None:
-    rng = np.random.default_rng(0)
-    points = np.concatenate([np.zeros((250, 3)), rng.uniform(-0.5, 0.5, (400, 3))])
-    ids = stable_ids(points)
-    patch = NeighbourIndex(points, 1.0, ids).patches(points[:1], ids[:1], 200, key=1).points[0]
-    elsewhere = int(patch.any(axis=1).sum())
-    assert 90 < elsewhere < 160  # 400 of 650 are, and a fair choice of 200 has 123 of them, give or take 7
-    assert not patch.any(axis=1).all()
+        _native.smallest_key(arrays, rows, radii, keys, owners)

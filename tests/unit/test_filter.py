@@ -2,12 +2,12 @@ from __future__ import annotations
 
 import threading
 import time
-from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from pointfilter import filtering, prediction
+from pointfilter import filter as filter_module
+from pointfilter import network as network_module
 from pointfilter.errors import (
     DegenerateCloudError,
     FilteringCancelledError,
@@ -15,16 +15,13 @@ from pointfilter.errors import (
     ParameterError,
     TooFewPointsError,
 )
-from pointfilter.filtering import (
-    Timings,
-    filter_points,
-    resolve_radius,
-)
-from pointfilter.patches import NeighbourIndex, sampling_key, stable_ids
-from pointfilter.prediction import MIN_NEIGHBOURS
-from tests.clouds import pooled, still
+from pointfilter.filter import resolve_radius
+from pointfilter.network import MIN_NEIGHBOURS
+from pointfilter.patches import NeighbourIndex, sampling_key
+from tests.clouds import filter_points, paper_network, pooled, pooled_displacements, still
 
 
+@paper_network
 def upwards(patches: np.ndarray) -> np.ndarray:
     """Half a radius along the z axis of every patch's frame."""
     return np.tile(np.array([0, 0, 0.5], np.float32), (len(patches), 1))
@@ -42,9 +39,9 @@ def test_a_point_moves_by_the_networks_answer_turned_back_and_scaled() -> None:
 def test_the_paper_s_equation_row_by_row(noisy_crease: np.ndarray) -> None:
     radius, offset = 0.15, (noisy_crease.min(axis=0) + noisy_crease.max(axis=0)) / 2
     points = noisy_crease - offset
-    ids = stable_ids(points)
-    patches = NeighbourIndex(points, radius, ids).patches(points, ids, 30, sampling_key(4, 0))
-    answers = pooled(patches.points).astype(np.float64)
+    rows = np.arange(len(points))
+    patches = NeighbourIndex(points, radius).patches(rows, np.full(len(rows), radius), 30, sampling_key(4, 0))
+    answers = pooled_displacements(patches.points).astype(np.float64)
     expected = noisy_crease + radius * np.stack(
         [np.linalg.inv(frame) @ answer for frame, answer in zip(patches.frames, answers, strict=True)]
     )
@@ -97,56 +94,24 @@ def test_every_iteration_works_on_the_points_of_the_one_before(noisy_crease: np.
     assert np.abs(twice - once).max() > 1e-3
 
 
-def test_the_radius_is_taken_once_from_the_input(noisy_crease: np.ndarray) -> None:
+def test_the_radius_of_the_paper_s_mode_is_taken_once_from_the_input(noisy_crease: np.ndarray) -> None:
     diagonal = np.linalg.norm(np.ptp(noisy_crease, axis=0))
     assert resolve_radius(noisy_crease, None) == pytest.approx(0.05 * diagonal)
     assert resolve_radius(noisy_crease, None, 0.2) == pytest.approx(0.2 * diagonal)
-    timings = Timings()
-    filtered = filter_points(noisy_crease, pooled, iterations=3, timings=timings)
-    assert timings.radius >= resolve_radius(noisy_crease, None)
-    np.testing.assert_array_equal(filtered, filter_points(noisy_crease, pooled, iterations=3, radius=timings.radius))
+    result = filter_module.filter_points(noisy_crease, pooled, iterations=3)
+    np.testing.assert_array_equal(result.radii, resolve_radius(noisy_crease, None))
+    assert result.passes == 3
+    assert filter_module.filter_points(noisy_crease, pooled).passes == filter_module.DEFAULT_ITERATIONS
 
 
 def test_each_iteration_draws_anew(noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     keys = []
-    real = filtering.sampling_key
+    real = filter_module.sampling_key
     monkeypatch.setattr(
-        filtering, "sampling_key", lambda seed, iteration: keys.append(real(seed, iteration)) or keys[-1]
+        filter_module, "sampling_key", lambda seed, iteration: keys.append(real(seed, iteration)) or keys[-1]
     )
     filter_points(noisy_crease, still, radius=0.1, iterations=3, seed=5)
     assert len(keys) == len(set(keys)) == 3
-
-
-def test_points_that_have_arrived_stay_and_cost_nothing(
-    noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Steps shrink from pass to pass; some points arrive in the second, the others in the third."""
-    monkeypatch.setattr(filtering, "DRIFT_FROM", 99)  # steps alone
-    radius, count = 0.15, len(noisy_crease)
-    evaluated: list[int] = []
-    seen: list[np.ndarray] = [noisy_crease]
-    passes = 0
-
-    def predict(patches: np.ndarray) -> np.ndarray:
-        evaluated.append(passes)
-        step = filtering.ARRIVED * (1.2 if len(evaluated) % 2 else 0.8) * (2.0, 1.0, 0.1)[passes]
-        return np.tile(np.array([0, 0, step], np.float32), (len(patches), 1))
-
-    def after(done: int, points: np.ndarray) -> None:
-        nonlocal passes
-        passes = done
-        seen.append(points)
-
-    filter_points(noisy_crease, predict, radius=radius, iterations=4, after_pass=after)
-    steps = [np.linalg.norm(b - a, axis=1) / radius for a, b in pairwise(seen)]
-    assert (steps[0] > 0).all()
-    assert (steps[1] > 0).all()
-    arrived = steps[1] < filtering.ARRIVED
-    assert 0 < arrived.sum() < count
-    assert (steps[2][arrived] == 0).all()
-    assert (steps[2][~arrived] > 0).all()
-    assert (steps[3] == 0).all()
-    assert set(evaluated) == {0, 1, 2}
 
 
 def test_every_pass_is_seen(noisy_crease: np.ndarray) -> None:
@@ -229,7 +194,7 @@ def test_any_floats_will_do(noisy_crease: np.ndarray) -> None:
 def test_progress_only_rises_and_ends_at_the_total(
     threads: int, noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(prediction, "ROWS_PER_BATCH", 500)
+    monkeypatch.setattr(network_module, "ROWS_PER_BATCH", 500)
     calls: list[tuple[int, int]] = []
     callers = set()
 
@@ -251,37 +216,23 @@ def test_progress_only_rises_and_ends_at_the_total(
 def test_cancellation_stops_after_the_batches_under_way(
     threads: int, noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(prediction, "ROWS_PER_BATCH", 1)
+    monkeypatch.setattr(network_module, "ROWS_PER_BATCH", 1)
     evaluated = 0
     lock = threading.Lock()
     stop = threading.Event()
 
+    @paper_network
     def predict(patches: np.ndarray) -> np.ndarray:
         nonlocal evaluated
         with lock:
             evaluated += 1
             if evaluated >= 10:
                 stop.set()
-        return pooled(patches)
+        return pooled_displacements(patches)
 
     with pytest.raises(FilteringCancelledError):
         filter_points(noisy_crease, predict, threads=threads, cancelled=stop.is_set)
     assert evaluated <= 10 + 4 * threads
-
-
-def test_counting_can_be_cancelled_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A ball that holds the whole cloud makes counting quadratic; nothing may run on after a cancellation."""
-    points = np.random.default_rng(0).normal(size=(20 * filtering.CENTRES_PER_COUNT, 3))
-    counted = []
-    real = filtering.NeighbourIndex.count
-    monkeypatch.setattr(
-        filtering.NeighbourIndex,
-        "count",
-        lambda self, centres, enough: counted.append(len(centres)) or real(self, centres),
-    )
-    with pytest.raises(FilteringCancelledError):
-        filter_points(points, pooled, radius=0.01, cancelled=lambda: True)
-    assert sum(counted) == filtering.CENTRES_PER_COUNT
 
 
 def test_nothing_is_left_running_after_a_cancellation(noisy_crease: np.ndarray) -> None:
@@ -292,6 +243,7 @@ def test_nothing_is_left_running_after_a_cancellation(noisy_crease: np.ndarray) 
 
 
 def test_an_error_in_the_network_comes_out_as_it_is(noisy_crease: np.ndarray) -> None:
+    @paper_network
     def broken(patches: np.ndarray) -> np.ndarray:
         raise RuntimeError("out of order")
 
@@ -299,17 +251,18 @@ def test_an_error_in_the_network_comes_out_as_it_is(noisy_crease: np.ndarray) ->
         filter_points(noisy_crease, broken, threads=2)
 
 
-def test_timings_are_added_up_by_stage(noisy_crease: np.ndarray) -> None:
+def test_seconds_are_added_up_by_stage(noisy_crease: np.ndarray) -> None:
+    @paper_network
     def slow(patches: np.ndarray) -> np.ndarray:
         time.sleep(0.01)
-        return still(patches)
+        return np.zeros((len(patches), 3), np.float32)
 
-    timings = Timings()
-    filter_points(noisy_crease, slow, iterations=2, timings=timings)
-    assert set(timings.as_dict()) == {"index", "patches", "infer", "drift"}
-    assert timings.infer >= 0.02
-    assert timings.index > 0
-    assert timings.patches > 0
+    seconds = filter_module.filter_points(noisy_crease, slow, iterations=2).seconds
+    assert tuple(seconds) == filter_module.STAGES
+    assert seconds["infer"] >= 0.02
+    assert seconds["index"] > 0
+    assert seconds["patches"] > 0
+    assert seconds["balls"] == 0
 
 
 # --- radii that make no sense ---
@@ -329,7 +282,9 @@ def test_a_cloud_too_small_to_compute_with(noisy_crease: np.ndarray) -> None:
 @pytest.mark.parametrize("answer", [np.nan, np.inf])
 def test_a_network_that_answers_nonsense_is_an_error(answer: float, noisy_crease: np.ndarray) -> None:
     with pytest.raises(InvalidModelError, match="finite"):
-        filter_points(noisy_crease, lambda patches: np.full((len(patches), 3), answer, np.float32), radius=0.15)
+        filter_points(
+            noisy_crease, paper_network(lambda patches: np.full((len(patches), 3), answer, np.float32)), radius=0.15
+        )
 
 
 def test_points_at_one_place_say_nothing_about_a_surface() -> None:

@@ -1,0 +1,100 @@
+"""What is measured of a network at export, on procedural clouds that no training sees: how the filter is to use its
+expected errors."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from pointfilter.adaptive.calibration import Calibration
+from pointfilter.engine import ADAPTIVE_OUTPUTS
+from pointfilter.filter import Filtered, filter_points
+from pointfilter.metrics import point_to_surface
+from pointfilter.network import Answers, Network
+from training.own import UNCALIBRATED
+from training.scanning import scan
+from training.shapes import Mesh, random_shape
+
+Float64 = NDArray[np.float64]
+
+FAMILY = 2  # of shapes; training has family 0, validation family 1
+CLOUDS = 6
+POINTS = (4_000, 12_000)
+LEVELS = (0.0025, 0.006, 0.015)  # of the noise, in turn; fractions of the diagonal
+MEASURED_POINTS = 1_500  # of a cloud, whose distances are taken
+PREFERENCES = (0.0, 0.1, 0.2)
+MARGINS = (0.1, 0.2)
+MOST_LOSS = 0.01  # of the error on noisy clouds, that a larger margin may cost for leaving clean ones as they are
+
+
+@dataclass(frozen=True, eq=False)
+class _Cloud:
+    noisy: Float64
+    mesh: Mesh
+    level: float
+
+
+def calibrate(serialised: bytes, patch_points: int) -> Calibration:
+    """The calibration of a serialised adaptive graph."""
+    network = _network(serialised)
+    noisy = [_cloud(number, LEVELS[number % len(LEVELS)]) for number in range(CLOUDS)]
+
+    def cost(calibration: Calibration) -> float:
+        """Mean logarithm of the distance that is left, as a share of the noise."""
+        left = [_distances(cloud, _filtered(cloud, network, calibration, patch_points)).mean() for cloud in noisy]
+        return float(np.mean(np.log(left) - np.log([cloud.level for cloud in noisy])))
+
+    chosen = min((dataclasses.replace(UNCALIBRATED, preference=preference) for preference in PREFERENCES), key=cost)
+    least = cost(chosen)
+    for margin in MARGINS:
+        larger = dataclasses.replace(chosen, margin=margin)
+        if cost(larger) <= least + MOST_LOSS:
+            chosen = larger
+    factors = []
+    for cloud in noisy:
+        filtered = _filtered(cloud, network, chosen, patch_points)
+        expected = filtered.errors[_measured(filtered)]
+        told = np.isfinite(expected)
+        if told.any():  # the network may have left the cloud alone
+            factors.append(np.log(_distances(cloud, filtered)[told].mean() / expected[told].mean()))
+    return dataclasses.replace(chosen, error_factor=float(np.exp(np.mean(factors))) if factors else 1.0)
+
+
+def _cloud(number: int, level: float) -> _Cloud:
+    mesh = random_shape(number, FAMILY)
+    rng = np.random.default_rng([number, 0xCA1])
+    return _Cloud(scan(mesh, POINTS[number // len(LEVELS) % len(POINTS)], level, rng, plain_share=1.0), mesh, level)
+
+
+def _filtered(cloud: _Cloud, network: Network, calibration: Calibration, patch_points: int) -> Filtered:
+    return filter_points(cloud.noisy, network, calibration=calibration, patch_points=patch_points)
+
+
+def _distances(cloud: _Cloud, filtered: Filtered) -> Float64:
+    """Distances of the measured points to the surface: (m,) float64."""
+    return point_to_surface(filtered.points[_measured(filtered)], cloud.mesh.vertices, cloud.mesh.faces)
+
+
+def _measured(filtered: Filtered) -> NDArray[np.int64]:
+    """Rows of at most MEASURED_POINTS points, spread over the cloud."""
+    count = len(filtered.points)
+    return np.linspace(0, count - 1, min(count, MEASURED_POINTS)).astype(np.int64)
+
+
+def _network(serialised: bytes) -> Network:
+    session = onnxruntime.InferenceSession(serialised, providers=["CPUExecutionProvider"])
+
+    def ask(
+        patches: NDArray[np.float32],
+        context: NDArray[np.float32],
+        queries: NDArray[np.float32],
+        owners: NDArray[np.int64],
+    ) -> Answers:
+        given = {"patches": patches, "context": context, "queries": queries, "owners": owners}
+        return Answers(*session.run(ADAPTIVE_OUTPUTS, given))
+
+    return ask

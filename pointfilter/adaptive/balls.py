@@ -1,0 +1,78 @@
+"""Which ball a point takes: the one in which the network expects the least error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pointfilter.adaptive.calibration import Calibration
+from pointfilter.errors import InvalidModelError
+from pointfilter.grids import Grids
+from pointfilter.network import Network, answers
+from pointfilter.patches import NeighbourIndex, UInt64
+from pointfilter.ranges import over_ranges
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+PROBE_REACH = 3.0  # distance to the probe that stands for a point, in units of the distance to its 24th neighbour
+SMOOTHED = 8  # probes whose expected errors are averaged
+SPREAD = 4  # probes whose radii a point takes the mean of
+PROBES_PER_TASK = 64
+
+
+def choose_balls(
+    points: Float64,
+    keys: UInt64,
+    reach: Float64,
+    network: Network,
+    calibration: Calibration,
+    patch_points: int,
+    key: int,
+    threads: int,
+    check: Callable[[], None],
+) -> tuple[Float64, Float64]:
+    """The radius (n,) of each point's ball, and the least logarithm (n,) of the expected error there as a share of the
+    error without a filter: above 0 where no ball helps.
+
+    Balls are compared by that share: the error without a filter is the same for all of them, so that what a ball knows
+    wrongly cancels out; one that holds nothing but noise underestimates both errors.
+
+    points: (n, 3) distinct, more of them than the smallest ball holds. keys, reach: of neighbourhood_keys. One point in
+    a neighbourhood is a probe: all balls of the calibration are evaluated for it. The expected errors are averaged over
+    SMOOTHED probes, for the least of several estimates is biased, and the radii over SPREAD.
+    """
+    grids = Grids(points)
+    probes = np.unique(grids.smallest_key(np.arange(len(points)), PROBE_REACH * reach, keys, threads, check))
+    sizes = np.array(calibration.balls)
+    radii, gains = np.empty((len(probes), len(sizes))), np.full((len(probes), len(sizes)), np.inf)
+
+    for rows, index in grids.by_radius(probes, reach[probes]):
+
+        def evaluate(first: int, last: int, rows: Int64 = rows, index: NeighbourIndex = index) -> None:
+            chosen = rows[first:last]
+            found = index.ball_radii(probes[chosen], np.tile(sizes, (len(chosen), 1)), reach[probes[chosen]])
+            radii[chosen] = found
+            there, column = np.nonzero(np.isfinite(found))
+            patches = index.patches(probes[chosen[there]], found[there, column], patch_points, key)
+            centres = np.zeros((len(there), 3), np.float32)
+            said = answers(network, patches.points, patches.counts, False, centres, np.arange(len(there)), check)
+            if said.log_errors is None:
+                raise InvalidModelError("the network has a calibration and answers without expected errors")
+            gains[chosen[there], column] = said.log_errors[:, 0] - said.log_errors[:, 1]
+
+        over_ranges(evaluate, len(rows), PROBES_PER_TASK, threads, check)
+
+    tree = cKDTree(points[probes])
+    _, near = tree.query(points[probes], k=np.arange(1, min(SMOOTHED, len(probes)) + 1), workers=threads)
+    gains = gains[near].mean(axis=1)
+    doublings = np.log2(np.where(np.isfinite(radii), radii, 1.0) / reach[probes][:, None])
+    wanted = gains + calibration.preference * doublings
+    best = len(sizes) - 1 - np.argmin(wanted[:, ::-1], axis=1)  # the larger at a tie
+    rows = np.arange(len(probes))
+    log_radii = np.log(radii[rows, best])
+    _, near = tree.query(points, k=np.arange(1, min(SPREAD, len(probes)) + 1), workers=threads)
+    return np.exp(log_radii[near].mean(axis=1)), gains[rows, best][near].mean(axis=1)

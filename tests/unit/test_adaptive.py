@@ -1,0 +1,239 @@
+"""Places, balls, which points move, and when the passes end."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pointfilter.adaptive.balls import choose_balls
+from pointfilter.adaptive.calibration import Calibration
+from pointfilter.adaptive.places import PLACEHOLDER_ROWS, distinct_places, neighbourhood_keys
+from pointfilter.errors import InvalidModelError
+from pointfilter.filter import filter_points, patch_centres
+from pointfilter.grids import Grids
+from pointfilter.network import Answers
+from tests.clouds import adaptive_pooled, pooled_displacements, rotation
+
+CALIBRATION = Calibration(
+    balls=(24, 48, 96, 192), preference=0.0, margin=0.0, passes=4, query_reach=0.4, error_factor=2.0
+)
+
+
+def plane(count: int, seed: int = 0, noise: float = 0.01) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(size=(count, 2)), noise * rng.normal(size=count)])
+
+
+def saying(gains: dict[int, float], step: float = 0.01, later: float | None = None):  # noqa: ANN201 - a network
+    """A network that answers for balls of 2^k points with the logarithm gains[k] of its error as a share of the error
+    without a displacement; in later passes with `later`."""
+
+    def ask(patches: np.ndarray, context: np.ndarray, queries: np.ndarray, owners: np.ndarray) -> Answers:
+        sizes = np.round(np.exp2(6 * (context[:, 0] + 1))).astype(int)
+        gain = np.array([gains[min(gains, key=lambda known: abs(known - size))] for size in sizes], np.float32)
+        if later is not None:
+            gain = np.where(context[:, 1] > 0, np.float32(later), gain)
+        still = np.full(len(owners), -1.0, np.float32)
+        moves = np.tile(np.array([0, 0, step], np.float32), (len(owners), 1))
+        return Answers(moves, np.stack([still + gain[owners], still], axis=1), moves)
+
+    return ask
+
+
+# --- places ---
+
+
+def test_rows_at_one_place_share_an_answer() -> None:
+    points = plane(500)
+    twice = np.vstack([points, points])
+    once = filter_points(points, adaptive_pooled, calibration=CALIBRATION, patch_points=50)
+    both = filter_points(twice, adaptive_pooled, calibration=CALIBRATION, patch_points=50)
+    np.testing.assert_array_equal(both.points, np.vstack([once.points, once.points]))
+    assert both.placeholder_rows == 0
+    assert (once.points != points).any()
+
+
+def test_a_place_with_far_more_rows_than_its_surroundings_is_left_and_counted() -> None:
+    points = plane(500)
+    with_zeros = np.vstack([points, np.zeros((PLACEHOLDER_ROWS, 3))])
+    result = filter_points(with_zeros, adaptive_pooled, calibration=CALIBRATION, patch_points=50)
+    alone = filter_points(points, adaptive_pooled, calibration=CALIBRATION, patch_points=50, origin=None)
+    assert result.placeholder_rows == PLACEHOLDER_ROWS
+    np.testing.assert_array_equal(result.points[500:], 0)
+    np.testing.assert_allclose(result.points[:500], alone.points, atol=1e-6)
+    fewer = np.vstack([points, np.zeros((PLACEHOLDER_ROWS - 1, 3))])
+    assert distinct_places(fewer).placeholder_rows == 0
+
+
+def test_a_cloud_of_copies_has_no_placeholder() -> None:
+    places = distinct_places(np.repeat(plane(200), 20, axis=0))
+    assert places.placeholder_rows == 0
+    assert len(places.points) == 200
+    np.testing.assert_array_equal(np.bincount(places.rows), 20)
+
+
+def test_one_place_alone() -> None:
+    assert len(distinct_places(np.ones((1000, 3))).points) == 1
+
+
+@given(seed=st.integers(0, 2**32), scale=st.floats(1e-3, 1e3))
+def test_keys_do_not_know_the_pose(seed: int, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(100, 3))
+    keys, reach = neighbourhood_keys(points)
+    turned, turned_reach = neighbourhood_keys(scale * (points @ rotation(rng).T) + 10 * scale)
+    assert (keys == turned).mean() > 0.98
+    np.testing.assert_allclose(turned_reach, scale * reach, rtol=1e-9)
+    assert len(set(keys.tolist())) == 100
+
+
+# --- balls ---
+
+
+def balls(points: np.ndarray, network: object, **changes: object) -> tuple[np.ndarray, np.ndarray]:
+    keys, reach = neighbourhood_keys(points)
+    calibration = dataclasses.replace(CALIBRATION, **changes)
+    return choose_balls(points, keys, reach, network, calibration, 50, 1, 2, lambda: None)
+
+
+@pytest.mark.parametrize("best", [24, 48, 96, 192])
+def test_the_ball_with_the_least_share_of_the_error(best: int) -> None:
+    points = plane(2_000, noise=0.0)
+    gains = {size: (-2.0 if size == best else -1.0) for size in CALIBRATION.balls}
+    radii, gain = balls(points, saying(gains))
+    expected = np.sqrt(best / (2_000 * np.pi))
+    inner = (np.abs(points[:, :2] - 0.5) < 0.3).all(axis=1)
+    np.testing.assert_allclose(np.median(radii[inner]), expected, rtol=0.15)
+    np.testing.assert_allclose(gain, -2.0, atol=1e-5)
+
+
+def test_the_larger_ball_at_a_tie_and_the_preferred_one() -> None:
+    points = plane(2_000, noise=0.0)
+    same = dict.fromkeys(CALIBRATION.balls, -1.0)
+    largest, _ = balls(points, saying(same))
+    smallest, _ = balls(points, saying(same), preference=0.1)
+    assert np.median(largest) / np.median(smallest) == pytest.approx(np.sqrt(192 / 24), rel=0.15)
+
+
+def test_balls_larger_than_the_cloud_are_left_out() -> None:
+    radii, _ = balls(plane(60), saying({24: -1.0, 48: -1.5, 96: -9.0, 192: -9.0}))
+    assert np.isfinite(radii).all()
+
+
+def test_a_network_that_does_not_say_its_errors_has_no_use_for_a_calibration() -> None:
+    def silent(patches: np.ndarray, context: np.ndarray, queries: np.ndarray, owners: np.ndarray) -> Answers:
+        return Answers(pooled_displacements(patches)[owners])
+
+    with pytest.raises(InvalidModelError, match="expected errors"):
+        balls(plane(200), silent)
+
+
+# --- which points move, and when it ends ---
+
+
+def test_where_no_ball_helps_nothing_moves() -> None:
+    points = plane(500)
+    calls = 0
+    network = saying(dict.fromkeys(CALIBRATION.balls, 0.1))
+
+    def counted(*arguments: np.ndarray) -> Answers:
+        nonlocal calls
+        calls += 1
+        return network(*arguments)
+
+    result = filter_points(points, counted, calibration=CALIBRATION, patch_points=50)
+    np.testing.assert_array_equal(result.points, points)
+    assert result.passes == 0
+    assert not result.moved.any()
+
+
+@pytest.mark.parametrize(("margin", "moves"), [(0.4, True), (0.6, False)])
+def test_the_error_must_fall_by_the_margin(margin: float, moves: bool) -> None:
+    network = saying(dict.fromkeys(CALIBRATION.balls, -0.5))
+    result = filter_points(
+        plane(500), network, calibration=dataclasses.replace(CALIBRATION, margin=margin), patch_points=50
+    )
+    assert result.moved.all() == moves
+    assert result.moved.any() == moves
+
+
+def test_the_filter_ends_when_another_pass_would_not_help() -> None:
+    points = plane(500)
+    network = saying(dict.fromkeys(CALIBRATION.balls, -1.0), later=0.2)
+    seen: list[int] = []
+    result = filter_points(
+        points, network, calibration=CALIBRATION, patch_points=50, after_pass=lambda passes, _: seen.append(passes)
+    )
+    assert result.passes == 2  # the second one finds that nothing is to be done
+    np.testing.assert_allclose(
+        np.linalg.norm(result.points - points, axis=1), 0.01 * result.radii, rtol=0.5
+    )  # one step, in the ball of the patch's centre
+    np.testing.assert_allclose(result.errors, 2.0 * np.exp(-1.0) * result.radii, rtol=0.5)
+    most = filter_points(points, network, calibration=CALIBRATION, patch_points=50, iterations=1)
+    np.testing.assert_array_equal(most.points, result.points)
+    endless = saying(dict.fromkeys(CALIBRATION.balls, -1.0))
+    assert filter_points(points, endless, calibration=CALIBRATION, patch_points=50).passes == CALIBRATION.passes
+
+
+def test_progress_has_its_bound_from_the_start_and_never_goes_back() -> None:
+    calls: list[tuple[int, int]] = []
+    filter_points(
+        plane(800),
+        adaptive_pooled,
+        calibration=CALIBRATION,
+        patch_points=50,
+        progress=lambda done, total: calls.append((done, total)),
+    )
+    done = [call[0] for call in calls]
+    assert {call[1] for call in calls} == {CALIBRATION.passes * 800}
+    assert done == sorted(done)
+    assert done[-1] == CALIBRATION.passes * 800
+
+
+def test_too_few_points_for_the_smallest_ball_come_back() -> None:
+    points = plane(20)
+    result = filter_points(points, adaptive_pooled, calibration=CALIBRATION, patch_points=50)
+    np.testing.assert_array_equal(result.points, points)
+    assert np.isnan(result.radii).all()
+
+
+def test_a_given_radius_is_every_point_s_ball() -> None:
+    result = filter_points(plane(500), adaptive_pooled, calibration=CALIBRATION, patch_points=50, radius=0.2)
+    np.testing.assert_array_equal(result.radii, 0.2)
+    assert result.moved.any()
+
+
+@given(seed=st.integers(0, 2**32), reach=st.floats(0.05, 1))
+def test_a_point_s_patch_is_around_a_point_close_by(seed: int, reach: float) -> None:
+    points = plane(400, seed)
+    keys, _ = neighbourhood_keys(points)
+    radii = np.random.default_rng(seed).uniform(0.05, 0.2, 400)
+    rows = np.arange(400)
+    owners = patch_centres(Grids(points), rows, radii, keys, reach, 1, lambda: None)
+    distances = np.linalg.norm(points - points[owners], axis=1)
+    assert (distances <= reach * np.minimum(radii, radii[owners]) + 1e-12).all()
+    shared = owners != rows
+    assert (keys[owners[shared]] < keys[rows[shared]]).all()
+
+
+# --- the calibration itself ---
+
+
+def test_a_calibration_survives_json() -> None:
+    assert Calibration.from_dict(CALIBRATION.as_dict()) == CALIBRATION
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"balls": []}, {"balls": [48, 24]}, {"balls": [2, 24]}, {"balls": [24.5]}, {"passes": 0}, {"passes": 1.5},
+        {"query_reach": 1.5}, {"error_factor": 0.0}, {"preference": float("nan")}, {"other": 1},
+    ],
+)  # fmt: skip
+def test_a_calibration_out_of_range_is_refused(change: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="calibration"):
+        Calibration.from_dict({**CALIBRATION.as_dict(), **change})
