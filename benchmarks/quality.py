@@ -1,7 +1,7 @@
 """Accuracy of the bundles and of the classics on clouds with known surfaces: one command, one table.
 
     python -m benchmarks.quality --data DIR                          # every bundle, classic and column: hours
-    python -m benchmarks.quality --data DIR --models pointfilter-fast --classics --columns '0.5 %' '1 %'
+    python -m benchmarks.quality --data DIR --models pointfilter-adaptive-int8 --classics --columns '0.5 %' '1 %'
     python -m benchmarks.quality --data DIR --json scores.json       # keeps every row; goes on where it stopped
     python -m benchmarks.quality --data DIR --classics --patch-points 64 128 256     # the curve over points a patch
 
@@ -22,7 +22,6 @@ import os
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +31,7 @@ from numpy.typing import NDArray
 from benchmarks import classics
 from benchmarks.subjects import COLUMNS, Column, Subject, load_clouds, load_meshes
 from pointfilter.engine import Engine
-from pointfilter.errors import FilteringCancelledError
-from pointfilter.filtering import filter_points
+from pointfilter.filter import DEFAULT_ITERATIONS, filter_points
 from pointfilter.metrics import closest_on_surface
 from pointfilter.models import ModelBundle, available_models, open_model
 
@@ -143,37 +141,24 @@ def _rows(
 def _filtered(noisy: Float64, engine: Engine) -> dict[str, tuple[Float64, float, int]]:
     """The cloud after 1, 2, 4 and auto iterations, with seconds and passes: one run sees them all.
 
-    A run of four passes goes through one and two of them, and through what auto would have chosen.
+    auto is what the filter does unless told otherwise: as many passes as help, or two in the paper's mode. Passes that
+    the filter does not make, because they would not help, leave the result of the one before.
     """
-    seen: dict[int, tuple[Float64, float]] = {}
-
-    automatic = 0
-
-    def planned(_done: int, total: int) -> None:
-        nonlocal automatic
-        automatic = total // len(noisy)
-
-    def run(iterations: Any, **more: Any) -> None:
-        filter_points(
-            noisy,
-            engine,
-            least_radius=engine.bundle.radius,
-            iterations=iterations,
-            patch_points=engine.bundle.patch_points,
-            threads=engine.threads,
-            **more,
-        )
-
+    seen: dict[int, tuple[Float64, float]] = {0: (noisy, 0.0)}
+    calibration = engine.bundle.calibration
+    automatic = DEFAULT_ITERATIONS if calibration is None else calibration.passes
     started = time.perf_counter()
-    with suppress(FilteringCancelledError):  # once it is known how many passes auto takes
-        run("auto", progress=planned, cancelled=lambda: automatic > 0)
-    judged = time.perf_counter() - started
-    started = time.perf_counter()
-    run(LONGEST, after_pass=lambda passes, points: seen.update({passes: (points, time.perf_counter() - started)}))
-    seen[0] = (noisy, 0.0)
-    result = {str(passes): (*seen[passes], passes) for passes in (1, 2, LONGEST)}
-    points, seconds = seen[automatic]
-    return {**result, "auto": (points, judged + seconds, automatic)}
+    filter_points(
+        noisy,
+        engine,
+        calibration=calibration,
+        iterations=max(LONGEST, automatic),
+        patch_points=engine.bundle.patch_points,
+        threads=engine.threads,
+        after_pass=lambda passes, points: seen.update({passes: (points, time.perf_counter() - started)}),
+    )
+    after = {passes: (*seen[min(passes, max(seen))], min(passes, max(seen))) for passes in (1, 2, LONGEST, automatic)}
+    return {**{str(passes): after[passes] for passes in (1, 2, LONGEST)}, "auto": after[automatic]}
 
 
 def _save(path: Path, table: list[Row]) -> None:

@@ -1,7 +1,7 @@
 """Speed of the bundles, of the whole filter and of what they are compared with: one command, one table.
 
     python -m benchmarks.speed                                       # 10 k, 100 k and 1 M points: about half an hour
-    python -m benchmarks.speed --points 100000 --models pointfilter-fast --classics
+    python -m benchmarks.speed --points 100000 --models pointfilter-adaptive-int8 --classics
     python -m benchmarks.speed --json speed.json                     # and keep the figures
     python -m benchmarks.speed --against speed.json                  # ratios to the figures of an earlier run
 
@@ -24,6 +24,7 @@ classic     of the quality benchmark, tuned for this noise; not beaten: as accur
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import importlib.util
 import itertools
 import json
@@ -52,11 +53,12 @@ from benchmarks.speed_report import CLASSIC_POINTS, ITERATIONS, Figures, compare
 from benchmarks.subjects import Column, Subject, sample_mesh
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine, available_cpus
+from pointfilter.filter import DEFAULT_RADIUS
 from pointfilter.models import DEFAULT_MODEL, available_models, open_model
+from pointfilter.network import context, patches_per_batch
 from pointfilter.noise import bounding_box_diagonal
-from pointfilter.patches import NeighbourIndex, stable_ids
+from pointfilter.patches import NeighbourIndex
 from pointfilter.pipeline import filter_cloud
-from pointfilter.prediction import patches_per_batch
 
 Float64 = NDArray[np.float64]
 
@@ -140,14 +142,20 @@ def network(model: str, device: str, threads: int) -> Figures:
     bundle = open_model(model)
     engine = Engine(bundle, device, threads)
     _, noisy = ring(20_000).clouds(COLUMN)
-    index, ids = _indexed(noisy, bundle.radius)
+    radius = DEFAULT_RADIUS * bounding_box_diagonal(noisy)
+    index = NeighbourIndex(noisy, radius)
     size = patches_per_batch(bundle.patch_points)
     batches = [
-        index.patches(noisy[start : start + size], ids[start : start + size], bundle.patch_points, 0).points
+        index.patches(np.arange(start, start + size), np.full(size, radius), bundle.patch_points, 0)
         for start in range(0, 64 * size, size)
     ]
-    batches = [batch for batch in batches if len(batch) == size]
-    calls = rate(lambda number: engine(batches[number % len(batches)]), threads)
+    centres, owners = np.zeros((size, 3), np.float32), np.arange(size)
+
+    def ask(number: int) -> None:
+        batch = batches[number % len(batches)]
+        engine(batch.points, context(batch.counts, later=False), centres, owners)
+
+    calls = rate(ask, threads)
     gflops = calls * size * patch_flops(bundle.network, bundle.patch_points) / 1e9
     best = sgemm(threads)
     return {
@@ -264,7 +272,7 @@ def naive(model: str, threads: int) -> Figures:
     settings = NetworkSettings.from_dict(bundle.network if bundle else {**PAPER, "norm_after_pool": False})
     length = bundle.patch_points if bundle else PAPER_POINTS
     torch.set_num_threads(threads)
-    net = Pointfilter(settings).eval()
+    net = Pointfilter(dataclasses.replace(settings, adaptive=False)).eval()
     _, points = ring(CLASSIC_POINTS).clouds(COLUMN)
     radius = 0.05 * bounding_box_diagonal(points)
     rng = np.random.default_rng(0)
@@ -311,11 +319,6 @@ def ring(points: int) -> Subject:
     """A ring with a square profile and so many points: flat and curved faces that meet in right angles."""
     mesh = trimesh.creation.annulus(r_min=0.3, r_max=0.5, height=0.3, sections=512)
     return sample_mesh("ring", np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64), points)
-
-
-def _indexed(points: Float64, fraction: float) -> tuple[NeighbourIndex, NDArray[np.uint64]]:
-    ids = stable_ids(points)
-    return NeighbourIndex(points, fraction * bounding_box_diagonal(points), ids), ids
 
 
 def _widths(network: Figures) -> str:

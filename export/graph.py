@@ -203,7 +203,7 @@ def _queried(graph: _Graph, features: str, matrix: Float64, bias: Float64) -> st
 
 
 def encoder_ranges(network: Pointfilter, patches: NDArray[np.float32]) -> list[float]:
-    """The largest outputs of the encoder's layers but the last on typical patches (B, N, 3), one in 200 000 left out."""
+    """Largest outputs of the encoder's layers but the last on typical patches (B, N, 3), one in 200 000 left out."""
     rows = patches.reshape(-1, 3).astype(np.float64)
     ranges = []
     for pair in network.encoder_layers()[:-1]:

@@ -16,6 +16,8 @@ from pointfilter.errors import ParameterError
 from pointfilter.filter import Filtered, filter_points, resolve_radius
 from pointfilter.network import MIN_NEIGHBOURS
 
+COARSE_STEP = 0.05  # of the median ball: larger steps of the file's coordinates are worth a warning
+
 
 @dataclass(frozen=True)
 class Radius:
@@ -193,11 +195,11 @@ def _warnings(cloud: PointCloud, points: NDArray[np.float64], result: Filtered) 
     if not np.isfinite(result.radii).any():
         warnings.append("there are too few points for the smallest ball; the cloud was left as it was")
     step = _storage_step(cloud, points)
-    told = np.isfinite(result.errors) & result.moved
-    if told.any() and step > 2 * float(np.median(result.errors[told])):
+    taken = result.radii[np.isfinite(result.radii)]
+    if len(taken) and step > COARSE_STEP * float(np.median(taken)):
         warnings.append(
-            f"the file keeps coordinates as float32, with steps of {step:.3g} at their largest, which is more than the "
-            "error that the filter leaves; subtract an offset from the coordinates, or save them as double"
+            f"the file keeps coordinates as float32, in steps of {step:.3g} where they are largest, which is coarse "
+            "beside the distances of neighbouring points; subtract an offset from the coordinates, or save them as double"
         )
     return tuple(warnings)
 

@@ -31,8 +31,8 @@ async def _order(
     radius: Annotated[
         str | None,
         Query(
-            description="Radius of all balls: a length in the unit of the file (0.02), or a share of the bounding box's "
-            "diagonal (5%, in an address 5%25); by default the network chooses one for each point",
+            description="Radius of all balls: a length in the unit of the file (0.02), or a share of the bounding "
+            "box's diagonal (5%, in an address 5%25); by default the network chooses one for each point",
             max_length=40,
         ),
     ] = None,
@@ -41,7 +41,9 @@ async def _order(
         Literal["same", "ascii", "binary_little_endian", "binary_big_endian"],
         Query(description="Encoding of the answer"),
     ] = "same",
-    strength: Annotated[float, Query(description="Of each displacement: 0 moves nothing, 1 all the way", ge=0, le=1)] = 1,
+    strength: Annotated[
+        float, Query(description="Of each displacement: 0 moves nothing, 1 all the way", ge=0, le=1)
+    ] = 1,
     max_move: Annotated[
         float | None, Query(description="Longest displacement of a point, in the unit of the file", gt=0)
     ] = None,

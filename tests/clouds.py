@@ -50,9 +50,7 @@ pooled = paper_network(pooled_displacements)
 still = paper_network(no_displacements)
 
 
-def adaptive_pooled(
-    patches: np.ndarray, context: np.ndarray, queries: np.ndarray, owners: np.ndarray
-) -> Answers:
+def adaptive_pooled(patches: np.ndarray, context: np.ndarray, queries: np.ndarray, owners: np.ndarray) -> Answers:
     """An adaptive network without a network. Its answers differ from query to query; the ratio of its errors depends on
     the points in the ball, on the pass and on the displacement."""
     moves = 0.5 * pooled_displacements(patches)[owners] - 0.3 * queries * np.abs(queries[:, 2:])

@@ -135,7 +135,8 @@ def make_clean(points: Float64, normals: Float64) -> CleanCloud:
 
 
 def make_cloud(noisy: Float64, clean: CleanCloud, radius: float = 0.0, later: bool = False) -> TrainingCloud:
-    """Indexes a noisy cloud; `radius` is absolute."""
+    """Indexes the distinct places of a noisy cloud, as the filter does; `radius` is absolute."""
+    noisy = np.unique(noisy, axis=0)
     edge = radius
     if not edge:
         ball, _ = cKDTree(noisy).query(noisy[:: max(1, len(noisy) // 500)], k=[min(TYPICAL_BALL, len(noisy))])

@@ -27,7 +27,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_holds_the_library_and_nothing_else(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
-    assert "pointfilter/bundles/pointfilter-fast-int8/model.onnx" in names
+    assert "pointfilter/bundles/pointfilter-adaptive-int8/model.onnx" in names
     assert any(name.startswith("pointfilter/_native") and name.endswith((".so", ".pyd")) for name in names)
     assert {name.split("/")[0] for name in names} <= {"pointfilter"} | {
         name.split("/")[0] for name in names if ".dist-info/" in name

@@ -28,7 +28,7 @@ def plane(count: int, seed: int = 0, noise: float = 0.01) -> np.ndarray:
     return np.column_stack([rng.uniform(size=(count, 2)), noise * rng.normal(size=count)])
 
 
-def saying(gains: dict[int, float], step: float = 0.01, later: float | None = None):  # noqa: ANN201 - a network
+def saying(gains: dict[int, float], step: float = 0.01, later: float | None = None):
     """A network that answers for balls of 2^k points with the logarithm gains[k] of its error as a share of the error
     without a displacement; in later passes with `later`."""
 

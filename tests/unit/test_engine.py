@@ -16,6 +16,13 @@ from pointfilter import engine as engine_module
 from pointfilter.engine import DEVICES, MAX_THREADS, Device, available_cpus
 from pointfilter.errors import InvalidModelError, ParameterError, ProviderUnavailableError
 from pointfilter.models import load_bundle
+from pointfilter.network import Answers
+
+
+def displacements(engine: Engine, patches: np.ndarray) -> np.ndarray:
+    count = len(patches)
+    none = np.zeros((count, 3), np.float32)
+    return engine(patches, none[:, :2], none, np.arange(count)).displacements
 
 
 def test_the_processor_is_always_there(bundle: ModelBundle) -> None:
@@ -76,7 +83,7 @@ def test_a_device_that_takes_one_call_at_a_time_gets_one(bundle: ModelBundle, mo
     engine._session = Watched()
     patches = np.random.default_rng(0).uniform(-1, 1, (50, 64, 3)).astype(np.float32)
     with ThreadPoolExecutor(4) as pool:
-        answers = list(pool.map(engine, [patches] * 20))
+        answers = list(pool.map(lambda one: displacements(engine, one), [patches] * 20))
     assert most == 1
     assert all((answer == answers[0]).all() for answer in answers)
 
@@ -123,7 +130,7 @@ def test_the_container_s_quota_counts(quota: str, cpus: int, monkeypatch: pytest
 def test_answers_have_a_row_a_patch_at_any_length(engine: Engine) -> None:
     rng = np.random.default_rng(0)
     for batch, length in [(1, 1), (3, 64), (7, 500)]:
-        answer = engine(rng.uniform(-1, 1, (batch, length, 3)).astype(np.float32))
+        answer = displacements(engine, rng.uniform(-1, 1, (batch, length, 3)).astype(np.float32))
         assert answer.shape == (batch, 3)
         assert answer.dtype == np.float32
         assert (np.abs(answer) <= 1).all()
@@ -133,14 +140,17 @@ def test_padding_with_the_centre_changes_nothing(engine: Engine) -> None:
     patches = np.random.default_rng(0).uniform(-1, 1, (5, 20, 3)).astype(np.float32)
     patches[:, 0] = 0
     padded = np.concatenate([patches, np.zeros((5, 44, 3), np.float32)], axis=1)
-    np.testing.assert_allclose(engine(padded), engine(patches), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(displacements(engine, padded), displacements(engine, patches), rtol=0, atol=1e-6)
 
 
 def test_several_threads_may_call_at_once(engine: Engine) -> None:
     patches = np.random.default_rng(0).uniform(-1, 1, (8, 64, 3)).astype(np.float32)
-    expected = engine(patches)
+    expected = displacements(engine, patches)
     answers: list[np.ndarray] = []
-    threads = [threading.Thread(target=lambda: answers.extend(engine(patches) for _ in range(20))) for _ in range(4)]
+    threads = [
+        threading.Thread(target=lambda: answers.extend(displacements(engine, patches) for _ in range(20)))
+        for _ in range(4)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -152,8 +162,8 @@ def test_several_threads_may_call_at_once(engine: Engine) -> None:
 def test_warming_up_is_one_real_inference(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     engine.warm_up()
     for wrong in (np.zeros((2, 4), np.float32), np.full((2, 3), np.nan, np.float32)):
-        monkeypatch.setattr(Engine, "__call__", lambda self, patches, wrong=wrong: wrong)
-        with pytest.raises(InvalidModelError, match="tiny"):
+        monkeypatch.setattr(Engine, "__call__", lambda self, *_, wrong=wrong: Answers(wrong))
+        with pytest.raises(InvalidModelError, match="tiny.*answered a test patch"):
             engine.warm_up()
 
 

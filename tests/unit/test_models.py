@@ -71,6 +71,9 @@ def test_altered_weights_are_noticed(copy: Path) -> None:
         load_bundle(copy)
 
 
+CALIBRATION = {
+    "balls": [24, 48], "preference": 0.1, "margin": 0.0, "passes": 3, "query_reach": 0.4, "error_factor": 1.2,
+}  # fmt: skip
 CHANGES: dict[str, Change] = {
     "another schema": lambda d: d.update(schema=SCHEMA + 1),
     "no schema": lambda d: d.pop("schema"),
@@ -83,8 +86,6 @@ CHANGES: dict[str, Change] = {
             "version",
             "sha256",
             "patch_points",
-            "radius",
-            "iterations",
             "network",
             "training",
             "scores",
@@ -95,14 +96,10 @@ CHANGES: dict[str, Change] = {
     "points as text": lambda d: d.update(patch_points="64"),
     "no points": lambda d: d.update(patch_points=0),
     "negative points": lambda d: d.update(patch_points=-5),
-    "no radius": lambda d: d.update(radius=0.0),
-    "radius that is none": lambda d: d.update(radius=float("nan")),
-    "radius over all": lambda d: d.update(radius=1.5),
-    "no iterations": lambda d: d.update(iterations=0),
-    "iterations by a word that nobody knows": lambda d: d.update(iterations="many"),
-    "iterations by halves": lambda d: d.update(iterations=1.5),
-    "radius by itself": lambda d: d.update(radius="auto"),
-    "iterations for ever": lambda d: d.update(iterations=10**6),
+    "too many points": lambda d: d.update(patch_points=10**6),
+    "a calibration that is none": lambda d: d.update(calibration=[1]),
+    "a calibration without balls": lambda d: d.update(calibration={**CALIBRATION, "balls": []}),
+    "a calibration that lacks a number": lambda d: d.update(calibration={"balls": [24]}),
 }
 
 
@@ -111,9 +108,21 @@ def test_a_bundle_from_before_there_were_precisions(copy: Path) -> None:
     assert load_bundle(copy).precision == "float32"
 
 
-def test_iterations_may_be_left_to_the_cloud(copy: Path) -> None:
-    change(copy, lambda d: d.update(iterations="auto"))
-    assert load_bundle(copy).iterations == "auto"
+def test_a_bundle_of_schema_1_runs_in_the_paper_s_mode(copy: Path) -> None:
+    def old(d: dict[str, Any]) -> None:
+        d.pop("calibration", None)
+        d.update(schema=1, radius=0.05, iterations="auto")
+
+    change(copy, old)
+    assert load_bundle(copy).calibration is None
+
+
+def test_a_calibration_is_read_and_shown(copy: Path) -> None:
+    change(copy, lambda d: d.update(calibration=CALIBRATION))
+    bundle = load_bundle(copy)
+    assert bundle.calibration is not None
+    assert bundle.calibration.balls == (24, 48)
+    assert bundle.summary()["calibration"] == CALIBRATION
 
 
 def test_the_folder_names_the_model(copy: Path) -> None:

@@ -120,9 +120,7 @@ def test_the_frame_sees_the_whole_ball_and_not_the_choice() -> None:
         assert set(map(tuple, patch.tolist())) <= set(map(tuple, every.tolist()))
 
 
-@given(
-    counts=st.lists(st.integers(0, 2000), max_size=80), longest=st.integers(1, 600)
-)
+@given(counts=st.lists(st.integers(0, 2000), max_size=80), longest=st.integers(1, 600))
 def test_every_patch_is_evaluated_once_at_a_length_that_fits(counts: list[int], longest: int) -> None:
     numbers = np.array(counts, dtype=np.int64)
     seen: list[int] = []

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pointfilter import Engine, PointCloud, PointfilterError, Radius, filter_cloud, filter_points
+from pointfilter import Engine, PointCloud, PointfilterError, Radius, filter_cloud
 from pointfilter.errors import DegenerateCloudError, ParameterError, TooFewPointsError
+from pointfilter.filter import DEFAULT_ITERATIONS, DEFAULT_RADIUS
+from tests.clouds import filter_points
+from tests.ply_files import ply_bytes
 
 
 @pytest.mark.parametrize(
@@ -28,19 +32,62 @@ def test_a_radius_that_is_none_names_both_forms(text: str) -> None:
     assert caught.value.actual == text
 
 
-def test_the_defaults_are_the_bundle_s(engine: Engine, noisy_crease: np.ndarray) -> None:
+def test_a_bundle_without_a_calibration_runs_in_the_paper_s_mode(engine: Engine, noisy_crease: np.ndarray) -> None:
     clean, report = filter_cloud(PointCloud(noisy_crease.copy()), engine)
     diagonal = float(np.linalg.norm(np.ptp(noisy_crease, axis=0)))
-    assert report.iterations == engine.bundle.iterations
-    assert report.radius >= engine.bundle.radius * diagonal  # more where a ball holds too few points: test_automatic.py
-    expected = filter_points(
-        noisy_crease,
-        engine,
-        radius=report.radius,
-        iterations=report.iterations,
-        patch_points=engine.bundle.patch_points,
-    )
+    assert report.iterations == DEFAULT_ITERATIONS
+    assert report.radius == report.radius_low == report.radius_high == pytest.approx(DEFAULT_RADIUS * diagonal)
+    assert report.expected_error is None
+    expected = filter_points(noisy_crease, engine, patch_points=engine.bundle.patch_points)
     np.testing.assert_allclose(clean.xyz, expected, rtol=0, atol=1e-6 * report.radius)
+
+
+def test_the_default_bundle_chooses_and_says_how_sure_it_is(default_engine: Engine, noisy_crease: np.ndarray) -> None:
+    cloud = PointCloud(noisy_crease.copy())
+    clean, report = filter_cloud(cloud, default_engine)
+    assert report.moved == (clean.xyz != noisy_crease).any(axis=1).sum() > 300
+    assert 0 < report.radius_low <= report.radius <= report.radius_high
+    assert report.expected_error is not None
+    assert 0 < report.expected_error < 0.02
+    _, paper = filter_cloud(cloud, default_engine, paper=True)
+    assert paper.iterations == DEFAULT_ITERATIONS
+    assert paper.radius == pytest.approx(DEFAULT_RADIUS * float(np.linalg.norm(np.ptp(noisy_crease, axis=0))))
+
+
+def test_strength_and_the_longest_move(default_engine: Engine, noisy_crease: np.ndarray) -> None:
+    cloud = PointCloud(noisy_crease.copy())
+    full = filter_cloud(cloud, default_engine)[0].xyz - noisy_crease
+    none, report = filter_cloud(cloud, default_engine, strength=0.0)
+    np.testing.assert_array_equal(none.xyz, noisy_crease)
+    assert report.moved == 0
+    half = filter_cloud(cloud, default_engine, strength=0.5)[0].xyz - noisy_crease
+    np.testing.assert_allclose(half, full / 2, atol=1e-12)
+    limit = float(np.median(np.linalg.norm(full, axis=1)))
+    short, report = filter_cloud(cloud, default_engine, max_move=limit)
+    lengths = np.linalg.norm(short.xyz - noisy_crease, axis=1)
+    np.testing.assert_allclose(lengths, np.minimum(np.linalg.norm(full, axis=1), limit), atol=1e-12)
+    assert report.largest_displacement <= limit * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("options", [{"strength": 1.5}, {"strength": -0.1}, {"max_move": 0.0}, {"max_move": np.nan}])
+def test_limits_that_make_no_sense_are_named(
+    options: dict[str, float], engine: Engine, noisy_crease: np.ndarray
+) -> None:
+    with pytest.raises(ParameterError, match=next(iter(options))):
+        filter_cloud(PointCloud(noisy_crease.copy()), engine, **options)
+
+
+def test_placeholders_and_coarse_coordinates_are_warned_of(
+    engine: Engine, default_engine: Engine, noisy_crease: np.ndarray, tmp_path: Path
+) -> None:
+    _, report = filter_cloud(PointCloud(np.vstack([noisy_crease, np.zeros((40, 3))])), engine)
+    assert report.placeholders == 40
+    assert any("40 rows" in warning for warning in report.warnings)
+    far = tmp_path / "far.ply"
+    rows = [tuple(row) for row in (noisy_crease + [5e6, 0, 0]).tolist()]
+    far.write_bytes(ply_bytes("ascii", rows, ["float x", "float y", "float z"]))
+    _, report = filter_cloud(PointCloud.read(far), default_engine)
+    assert any("float32" in warning for warning in report.warnings)
 
 
 def test_the_report_says_what_was_done(engine: Engine, noisy_crease: np.ndarray) -> None:
@@ -52,7 +99,7 @@ def test_the_report_says_what_was_done(engine: Engine, noisy_crease: np.ndarray)
     assert report.largest_displacement == pytest.approx(moved.max())
     assert (report.points, report.skipped, report.iterations, report.radius, report.seed) == (600, 0, 1, 0.2, 9)
     assert (report.model, report.model_sha256) == (engine.bundle.name, engine.bundle.sha256)
-    assert report.seconds.keys() == {"index", "patches", "infer", "drift", "total"}
+    assert report.seconds.keys() == {"index", "balls", "patches", "infer", "total"}
     json.dumps(report.as_dict())
     for fact in (report.model, report.model_version, report.model_sha256[:16], "iterations 1", "radius 0.2", "seed 9"):
         assert fact in report.comment

@@ -10,6 +10,7 @@ from pointfilter import errors
 def test_the_public_names_are_these() -> None:
     assert pointfilter.__all__ == [
         "Engine",
+        "Filtered",
         "ModelBundle",
         "PointCloud",
         "PointfilterError",
