@@ -109,7 +109,8 @@ def filter_points(
         radius = resolve_radius(points, radius)
         passes = DEFAULT_ITERATIONS if iterations is None else iterations
     else:
-        radius = None if radius is None else resolve_radius(points, radius)
+        resolved = resolve_radius(points, radius)  # checks the extent, too
+        radius = None if radius is None else resolved
         passes = calibration.passes if iterations is None else iterations
 
     def check() -> None:

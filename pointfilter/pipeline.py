@@ -199,7 +199,7 @@ def _warnings(cloud: PointCloud, points: NDArray[np.float64], result: Filtered) 
     if len(taken) and step > COARSE_STEP * float(np.median(taken)):
         warnings.append(
             f"the file keeps coordinates as float32, in steps of {step:.3g} where they are largest, which is coarse "
-            "beside the distances of neighbouring points; subtract an offset from the coordinates, or save them as double"
+            "beside the distances between points; subtract an offset from the coordinates, or save them as double"
         )
     return tuple(warnings)
 

@@ -16,8 +16,10 @@ from types import SimpleNamespace
 import numpy as np
 
 from pointfilter import PointCloud, filter_cloud
+from pointfilter.adaptive.calibration import Calibration
+from pointfilter.network import Answers
 from tests.attacks.files import ATTACKS
-from tests.clouds import pooled
+from tests.clouds import adaptive_pooled
 
 SECONDS = 10  # after so many an attack has won
 
@@ -25,12 +27,20 @@ MEMORY = 256 << 20  # bytes that the process may grow by; the largest file that 
 
 
 class FakeEngine:
-    bundle = SimpleNamespace(name="fake", version="0", sha256="0" * 64, iterations=2, radius=0.05, patch_points=64)
+    bundle = SimpleNamespace(
+        name="fake",
+        version="0",
+        sha256="0" * 64,
+        patch_points=64,
+        calibration=Calibration(
+            balls=(24, 96, 384), preference=0.0, margin=0.0, passes=2, query_reach=0.4, error_factor=1.0
+        ),
+    )
     provider = "none"
     threads = 1
 
-    def __call__(self, patches: np.ndarray) -> np.ndarray:
-        return pooled(patches)
+    def __call__(self, patches: np.ndarray, context: np.ndarray, queries: np.ndarray, owners: np.ndarray) -> Answers:
+        return adaptive_pooled(patches, context, queries, owners)
 
 
 def give_up(*_: object) -> None:

@@ -25,10 +25,10 @@ def test_ready_only_after_a_real_inference(
     inferences: list[int] = []
 
     class Slow(Engine):
-        def __call__(self, patches: Any) -> Any:
+        def __call__(self, patches: Any, *others: Any) -> Any:
             go_on.wait(20)
             inferences.append(len(patches))
-            return super().__call__(patches)
+            return super().__call__(patches, *others)
 
     monkeypatch.setattr(service.engines, "Engine", Slow)
     with TestClient(create_app(make_settings())) as client:

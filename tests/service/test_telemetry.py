@@ -45,7 +45,7 @@ def test_every_promised_metric_is_there(client: TestClient, ply: bytes) -> None:
     families = {family.name: family for family in text_string_to_metric_families(answer.text)}
     assert {name: families[name].type for name in NAMES} == NAMES
     stages = {sample.labels["stage"] for sample in families["pointfilter_stage_duration_seconds"].samples}
-    assert stages == {"parse", "index", "patches", "infer", "drift", "write"}
+    assert stages == {"parse", "index", "balls", "patches", "infer", "write"}
     info = next(sample for sample in families["pointfilter_model_info"].samples)
     assert info.labels.keys() == {"model", "version", "sha256", "provider"}
     assert info.labels["provider"] == "CPUExecutionProvider"

@@ -163,7 +163,7 @@ def test_warming_up_is_one_real_inference(engine: Engine, monkeypatch: pytest.Mo
     engine.warm_up()
     for wrong in (np.zeros((2, 4), np.float32), np.full((2, 3), np.nan, np.float32)):
         monkeypatch.setattr(Engine, "__call__", lambda self, *_, wrong=wrong: Answers(wrong))
-        with pytest.raises(InvalidModelError, match="tiny.*answered a test patch"):
+        with pytest.raises(InvalidModelError, match=r"tiny.*answered a test patch"):
             engine.warm_up()
 
 

@@ -84,7 +84,7 @@ def test_placeholders_and_coarse_coordinates_are_warned_of(
     assert report.placeholders == 40
     assert any("40 rows" in warning for warning in report.warnings)
     far = tmp_path / "far.ply"
-    rows = [tuple(row) for row in (noisy_crease + [5e6, 0, 0]).tolist()]
+    rows = [tuple(row) for row in (noisy_crease + np.array([5e6, 0, 0])).tolist()]
     far.write_bytes(ply_bytes("ascii", rows, ["float x", "float y", "float z"]))
     _, report = filter_cloud(PointCloud.read(far), default_engine)
     assert any("float32" in warning for warning in report.warnings)

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pointfilter import Engine, PointCloud, filter_cloud
+from pointfilter import Engine, PointCloud, Radius, filter_cloud
 from tests.ply_files import AXES, CODES, ORDERS, Column, Table, Written, ply_bytes, write_ply
 
 ENCODINGS = ["ascii", *ORDERS]
@@ -256,7 +256,7 @@ def test_a_filtered_scan_differs_in_coordinates_only(encoding: str, engine: Engi
     source, target = tmp_path / "in.ply", tmp_path / "out.ply"
     source.write_bytes(before.data)
     cloud = PointCloud.read(source)
-    filtered, report = filter_cloud(cloud, engine)
+    filtered, report = filter_cloud(cloud, engine, radius=Radius(0.1, relative=True))
     filtered.write(target, comment=report.comment)
     assert source.read_bytes() == before.data
 
