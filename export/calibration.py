@@ -26,8 +26,8 @@ CLOUDS = 6
 POINTS = (4_000, 12_000)
 LEVELS = (0.0025, 0.006, 0.015)  # of the noise, in turn; fractions of the diagonal
 MEASURED_POINTS = 1_500  # of a cloud, whose distances are taken
-PREFERENCES = (0.0, 0.1, 0.2)
-MARGINS = (0.1, 0.2)
+PREFERENCES = (-0.1, 0.0, 0.1, 0.2)
+MARGINS = (0.0, 0.1, 0.2)
 MOST_LOSS = 0.01  # of the error on noisy clouds, that a larger margin may cost for leaving clean ones as they are
 
 
