@@ -136,7 +136,8 @@ def make_clean(points: Float64, normals: Float64) -> CleanCloud:
 
 def make_cloud(noisy: Float64, clean: CleanCloud, radius: float = 0.0, later: bool = False) -> TrainingCloud:
     """Indexes the distinct places of a noisy cloud, as the filter does; `radius` is absolute."""
-    noisy = np.unique(noisy, axis=0)
+    _, first = np.unique(noisy, axis=0, return_index=True)
+    noisy = noisy[np.sort(first)]
     edge = radius
     if not edge:
         ball, _ = cKDTree(noisy).query(noisy[:: max(1, len(noisy) // 500)], k=[min(TYPICAL_BALL, len(noisy))])
