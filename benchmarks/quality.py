@@ -2,15 +2,17 @@
 
     python -m benchmarks.quality --data DIR                          # every bundle, classic and column: hours
     python -m benchmarks.quality --data DIR --models pointfilter-adaptive-int8 --classics --columns '0.5 %' '1 %'
+    python -m benchmarks.quality --data DIR --columns 'shapes 1 %' printed --clouds lion busted tp
     python -m benchmarks.quality --data DIR --json scores.json       # keeps every row; goes on where it stopped
     python -m benchmarks.quality --data DIR --classics --patch-points 64 128 256     # the curve over points a patch
 
-DIR holds paper4/ (clean clouds NAME.npy, noisy copies NAME_0.005.npy, surfaces mesh/*.ply) and meshes/*.ply; either may
-be missing. The data is not part of this repository: --data or POINTFILTER_BENCHMARK_DATA says where it lies.
+DIR holds paper4/, meshes/, shapes/ and printed/ as subjects.py describes them; any of them may be missing. The data is
+not part of this repository: --data or POINTFILTER_BENCHMARK_DATA says where it lies.
 
 Rows: noisy; limit, the exact projection of the noisy points onto the surface; every bundle after 1, 2, 4 and auto
 iterations; the classics (classics/), each tuned on the paper's clouds for the noise at hand. Columns: subjects.py.
-CD ×1e5, P2F ×1e3, both for a clean cloud scaled to a diagonal of 1 (§4.3); edge: P2F close to sharp edges.
+CD ×1e5, P2F ×1e3, both for a clean cloud scaled to a diagonal of 1 (§4.3); edge: P2F close to sharp edges. In the
+column printed, real scans against the meshes that were scanned, the row noisy is the scan as it is.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import classics
-from benchmarks.subjects import COLUMNS, Column, Subject, load_clouds, load_meshes
+from benchmarks.subjects import COLUMNS, SETS, Column, Subject
 from pointfilter.engine import Engine
 from pointfilter.filter import DEFAULT_ITERATIONS, filter_points
 from pointfilter.metrics import closest_on_surface
@@ -43,30 +45,28 @@ LONGEST = 4  # iterations of the longest row
 
 def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
-    folders = [] if options.data is None else [Path(options.data, name) for name in ("paper4", "meshes")]
-    if not any(folder.is_dir() for folder in folders):
+    columns = [column for column in COLUMNS if column.name in options.columns]
+    measured = _measured(options.data, columns, options.clouds)
+    if not measured:
+        named = f" of {', '.join(options.clouds)}" if options.clouds else ""
         print(
-            "no benchmark data: name a folder with paper4/ or meshes/ by --data or POINTFILTER_BENCHMARK_DATA",
+            f"no benchmark data{named} for these columns: name a folder that holds one of "
+            f"{', '.join(f'{folder}/' for folder, _ in SETS.values())} by --data or POINTFILTER_BENCHMARK_DATA",
             file=sys.stderr,
         )
         return 2
-    subjects = {
-        "paper": load_clouds(folders[0]) if folders[0].is_dir() else [],
-        "meshes": load_meshes(folders[1]) if folders[1].is_dir() else [],
-    }
     engines = [Engine(bundle) for name in options.models for bundle in _lengths(open_model(name), options.patch_points)]
     for name, reason in classics.available().items():
         if name in options.classics and reason:
             print(f"left out: {name}: {reason}", file=sys.stderr)
             options.classics.remove(name)
     table: list[Row] = json.loads(options.json.read_text())["rows"] if options.json and options.json.exists() else []
-    for column in (column for column in COLUMNS if column.name in options.columns):
-        for subject in subjects[column.subjects]:
-            for row in _rows(subject, column, engines, options.classics, table):
-                table.append(row)
-                print("  " + _line(row), file=sys.stderr, flush=True)
-                if options.json:
-                    _save(options.json, table)
+    for column, subject in measured:
+        for row in _rows(subject, column, engines, options.classics, table):
+            table.append(row)
+            print("  " + _line(row), file=sys.stderr, flush=True)
+            if options.json:
+                _save(options.json, table)
     print(report(table, options.columns))
     return 0
 
@@ -87,6 +87,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME",
         help=", ".join(columns).replace("%", "%%"),
     )
+    parser.add_argument("--clouds", nargs="+", default=[], metavar="NAME", help="measure on these alone; default: all")
     parser.add_argument(
         "--patch-points",
         type=int,
@@ -99,6 +100,20 @@ def _parser() -> argparse.ArgumentParser:
         "--json", type=Path, help="keep the rows there; those of the same weights are not measured again"
     )
     return parser
+
+
+def _measured(data: Path | None, columns: list[Column], clouds: list[str]) -> list[tuple[Column, Subject]]:
+    """Every column with each of its clouds that there is, restricted to `clouds` where some are named."""
+    found: dict[str, list[Subject]] = {}
+    for name in {column.subjects for column in columns}:
+        folder, load = SETS[name]
+        found[name] = load(Path(data, folder)) if data is not None and Path(data, folder).is_dir() else []
+    return [
+        (column, subject)
+        for column in columns
+        for subject in found[column.subjects]
+        if subject.name in (column.only or [subject.name]) and subject.name in (clouds or [subject.name])
+    ]
 
 
 def _lengths(bundle: ModelBundle, patch_points: Iterable[int]) -> Iterator[ModelBundle]:
@@ -144,11 +159,11 @@ def _filtered(noisy: Float64, engine: Engine) -> dict[str, tuple[Float64, float,
     auto is what the filter does unless told otherwise: as many passes as help, or two in the paper's mode. Passes that
     the filter does not make, because they would not help, leave the result of the one before.
     """
-    seen: dict[int, tuple[Float64, float]] = {0: (noisy, 0.0)}
+    seen: dict[int, tuple[Float64, float]] = {}
     calibration = engine.bundle.calibration
     automatic = DEFAULT_ITERATIONS if calibration is None else calibration.passes
     started = time.perf_counter()
-    filter_points(
+    result = filter_points(
         noisy,
         engine,
         calibration=calibration,
@@ -157,8 +172,12 @@ def _filtered(noisy: Float64, engine: Engine) -> dict[str, tuple[Float64, float,
         threads=engine.threads,
         after_pass=lambda passes, points: seen.update({passes: (points, time.perf_counter() - started)}),
     )
-    after = {passes: (*seen[min(passes, max(seen))], min(passes, max(seen))) for passes in (1, 2, LONGEST, automatic)}
-    return {**{str(passes): after[passes] for passes in (1, 2, LONGEST)}, "auto": after[automatic]}
+    seen[result.passes] = (
+        result.points,
+        time.perf_counter() - started,
+    )  # the choice of balls is all there is to 0 passes
+    rows = {**{str(passes): passes for passes in (1, 2, LONGEST)}, "auto": automatic}
+    return {name: (*seen[min(passes, result.passes)], min(passes, result.passes)) for name, passes in rows.items()}
 
 
 def _save(path: Path, table: list[Row]) -> None:
@@ -181,7 +200,7 @@ def means(table: list[Row]) -> list[Row]:
 
 def report(table: list[Row], columns: Iterable[str]) -> str:
     """The table as text: every cloud, then the means, column by column."""
-    head = f"{'column':18}{'cloud':20}{'method':26}{'CD x1e5':>9}{'P2F x1e3':>10}{'edge x1e3':>10}"
+    head = f"{'column':20}{'cloud':20}{'method':26}{'CD x1e5':>9}{'P2F x1e3':>10}{'edge x1e3':>10}"
     lines = [f"{head}{'seconds':>9}{'passes':>8}"]
     for rows in (table, means(table)):
         for column in columns:
@@ -190,7 +209,7 @@ def report(table: list[Row], columns: Iterable[str]) -> str:
 
 
 def _line(row: Row) -> str:
-    named = f"{row['column']:18}{row['cloud']:20}{row['method']:26}"
+    named = f"{row['column']:20}{row['cloud']:20}{row['method']:26}"
     figures = f"{row['cd']:9.3f}{row['p2f']:10.3f}{row['edge']:10.3f}{row['seconds']:9.1f}"
     return named + figures + (f"{row['passes']:8d}" if "passes" in row else "")
 

@@ -25,9 +25,10 @@ SGEMM_SIZES = (256, 512, 1024, 2048)
 
 
 def patch_flops(widths: dict[str, Any], points: int) -> float:
-    """Multiplications and additions of the network's products for one patch."""
+    """Multiplications and additions of the network's products for one patch and one query."""
+    more, answers = (5, 8) if widths.get("adaptive") else (0, 3)  # inputs beside the features, and outputs
     encoder = [3, *widths["encoder"]]
-    decoder = [encoder[-1], *widths["decoder"], 3]
+    decoder = [encoder[-1] + more, *widths["decoder"], answers]
 
     def products(layers: list[int]) -> int:
         return sum(a * b for a, b in itertools.pairwise(layers))

@@ -11,8 +11,8 @@ Needs no data: the cloud is a ring with sharp edges and 0.5 % noise.
 network     real patches of that cloud through the network alone; GFLOP/s count multiplications and additions of its
             layers; share: of the best sgemm (NumPy's) in the same process, with the same number of threads
 end_to_end  a binary PLY read, filtered twice, written; stages in seconds of the clock (the work of several threads
-            divided by their number); peak: of the process's memory. More than 100 k points: with the default model
-            only, unless others are named
+            divided by their number; balls: the choice of them, which asks the network too); peak: of the process's
+            memory. More than 100 k points: with the default model only, unless others are named
 served      the same file through `python -m service`, from the first byte sent to the last one received, alone and
             two at once
 naive       research code's way: one patch at a time in Python, then torch in batches of 64; timed on a sample and
@@ -196,6 +196,7 @@ def end_to_end(model: str, device: str, threads: int, points: int) -> Figures:
         "seconds": seconds,
         "read": read,
         "index": stages["index"],
+        "balls": stages["balls"],
         "patches": stages["patches"] / threads,
         "network": infer,
         "write": finished - writing,

@@ -26,7 +26,9 @@ def line(row: Figures) -> str:
             f" {row['share']:.0%} of sgemm's {row['sgemm_gflops']:.1f}"
         )
     elif row["what"] == "end_to_end":
-        stages = ", ".join(f"{name} {row[name]:.2f}" for name in ("read", "index", "patches", "network", "write"))
+        stages = ", ".join(
+            f"{name} {row[name]:.2f}" for name in ("read", "index", "balls", "patches", "network", "write")
+        )
         figures = (
             f"{row['points']:8d} points × {ITERATIONS}: {row['seconds']:7.2f} s ({stages}); not the network "
             f"{row['not_network']:.0%}; peak {row['peak_mb']:.0f} MB"

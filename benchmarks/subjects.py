@@ -1,15 +1,22 @@
 """What the quality benchmark measures on: clean clouds with their surfaces, and the noisy clouds made of them.
 
-A folder is laid out like the paper's test clouds: NAME.npy (clean), NAME_0.005.npy (noisy, row for row) and mesh/*.ply
-(surfaces; the one that fits a cloud is found by distance). A noisy cloud that is not on disk is made from the clean one
-with a seed of its own, the same in every run.
+Four sets, each in a folder of its own:
+
+paper     paper4/: NAME.npy (clean), NAME_0.005.npy (noisy, row for row) and mesh/*.ply (surfaces; the one that fits a
+          cloud is found by distance)
+meshes    meshes/*.ply, sampled
+shapes    shapes/*.ply, sampled more densely
+printed   printed/: NAME_scan.ply, a real scan, and NAME_truth.ply, the mesh that was scanned, in the same place
+
+A noisy cloud that is not on disk is made from the clean one with a seed of its own, the same in every run.
 """
 
 from __future__ import annotations
 
 import re
 import zlib
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -19,6 +26,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pointfilter.cloud import PointCloud
 from pointfilter.evaluation import read_mesh
 from pointfilter.metrics import chamfer_distance, normalised, point_to_surface
 from pointfilter.noise import NoiseKind, add_noise
@@ -30,7 +38,10 @@ EDGE_REACH = 0.01  # of the diagonal: a point counts for `edge` when the clean p
 EDGE_SPACING = 0.0005  # of the diagonal: how densely sharp edges are sampled to find them
 THINNEST = 0.1  # of the density of the dense side, on the thin side of an uneven cloud
 
-Set = Literal["paper", "meshes"]
+MESH_POINTS = 200_000  # of the clean cloud of a mesh
+SHAPE_POINTS = 400_000
+
+Set = Literal["paper", "meshes", "shapes", "printed"]
 
 
 @dataclass(frozen=True)
@@ -45,6 +56,8 @@ class Column:
     uneven: bool = False
     """Density falls to a tenth from one side to the other."""
     subjects: Set = "paper"
+    only: tuple[str, ...] = ()
+    """Of these clouds; none: of all in the set."""
 
 
 COLUMNS = (
@@ -61,6 +74,13 @@ COLUMNS = (
     Column("50 k", 0.005, points=50_000),
     Column("uneven", 0.005, uneven=True),
     Column("meshes 10 k 1 %", 0.01, points=10_000, subjects="meshes"),
+    Column("shapes clean", 0.0, points=100_000, subjects="shapes"),
+    Column("shapes 0.5 %", 0.005, points=100_000, subjects="shapes"),
+    Column("shapes 1 %", 0.01, points=100_000, subjects="shapes"),
+    Column("shapes 2.5 %", 0.025, points=100_000, subjects="shapes"),
+    Column("shapes 10 k 1 %", 0.01, points=10_000, subjects="shapes"),
+    Column("shapes 400 k 0.5 %", 0.005, subjects="shapes", only=("busted", "screwdriver", "lion", "springer")),
+    Column("printed", 0.001, subjects="printed"),  # the level is for the classics: the noise is the scanner's
 )
 
 
@@ -74,6 +94,8 @@ class Subject:
     faces: NDArray[np.int64]
     noisy_files: dict[float, Path] = field(default_factory=dict)
     """Noisy copies of the clean cloud on disk, by level."""
+    scan: Float64 | None = None
+    """A real scan (k, 3) of the surface: the noisy cloud of every column."""
 
     @cached_property
     def sharp_edges(self) -> Float64:
@@ -90,7 +112,9 @@ class Subject:
         return np.concatenate([np.empty((0, 3)), *edges])
 
     def clouds(self, column: Column) -> tuple[Float64, Float64]:
-        """The clean and the noisy cloud of a column, row for row."""
+        """The clean and the noisy cloud of a column, row for row unless the noisy one is a real scan."""
+        if self.scan is not None:
+            return self.clean, self.scan
         if (
             column.kind == "gaussian"
             and column.points is None
@@ -142,9 +166,33 @@ def load_clouds(folder: Path) -> list[Subject]:
     return subjects
 
 
-def load_meshes(folder: Path, points: int = 200_000) -> list[Subject]:
+def load_meshes(folder: Path, points: int = MESH_POINTS) -> list[Subject]:
     """Every .ply mesh of a folder, with clean points spread evenly over it."""
     return [sample_mesh(path.stem, *read_mesh(path), points) for path in sorted(folder.glob("*.ply"))]
+
+
+def load_shapes(folder: Path) -> list[Subject]:
+    """The same, with SHAPE_POINTS points each."""
+    return load_meshes(folder, SHAPE_POINTS)
+
+
+def load_printed(folder: Path) -> list[Subject]:
+    """Every NAME_scan.ply of a folder with its NAME_truth.ply."""
+    subjects = []
+    for path in sorted(folder.glob("*_scan.ply")):
+        name = path.stem.removesuffix("_scan")
+        truth = sample_mesh(name, *read_mesh(folder / f"{name}_truth.ply"), MESH_POINTS)
+        subjects.append(replace(truth, scan=PointCloud.read(path).xyz))
+    return subjects
+
+
+SETS: dict[Set, tuple[str, Callable[[Path], list[Subject]]]] = {
+    "paper": ("paper4", load_clouds),
+    "meshes": ("meshes", load_meshes),
+    "shapes": ("shapes", load_shapes),
+    "printed": ("printed", load_printed),
+}
+"""Set -> its folder and what reads it."""
 
 
 def sample_mesh(name: str, vertices: Float64, faces: NDArray[np.int64], points: int) -> Subject:

@@ -12,10 +12,14 @@ import pytest
 
 pytest.importorskip("trimesh", reason="the benchmarks extra is not installed")
 
-from benchmarks import quality
-from benchmarks.subjects import COLUMNS, Column, Subject, load_clouds, load_meshes
+from benchmarks import quality, subjects
+from benchmarks.rates import patch_flops
+from benchmarks.subjects import COLUMNS, Column, Subject, load_clouds, load_meshes, load_printed, load_shapes
 from pointfilter import Engine, PointCloud, filter_cloud
+from pointfilter.adaptive.calibration import Calibration
+from pointfilter.metrics import point_to_surface
 from pointfilter.models import load_bundle
+from pointfilter.network import Answers
 from pointfilter.noise import add_noise
 from tests.clouds import crease
 
@@ -40,8 +44,11 @@ def data(tmp_path: Path) -> Path:
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1]], dtype=np.float64)
     faces = np.array([[0, 1, 2], [0, 2, 3], [0, 5, 4], [0, 3, 5]])
     write_mesh(tmp_path / "paper4" / "mesh" / "surface.ply", corners, faces)
-    (tmp_path / "meshes").mkdir()
-    write_mesh(tmp_path / "meshes" / "angle.ply", corners, faces)
+    for folder, names in (("meshes", ["angle"]), ("shapes", ["angle", "lion"]), ("printed", ["angle_truth"])):
+        (tmp_path / folder).mkdir()
+        for name in names:
+            write_mesh(tmp_path / folder / f"{name}.ply", corners, faces)
+    PointCloud(add_noise(clean, FINE, rng)).write(tmp_path / "printed" / "angle_scan.ply")
     return tmp_path
 
 
@@ -92,6 +99,39 @@ def test_meshes_are_sampled(data: Path) -> None:
     (subject,) = load_meshes(data / "meshes", points=500)
     assert len(subject.clean) == 500
     assert subject.scores(subject.clean, subject.clean)["p2f"] < 1e-9
+
+
+def test_shapes_are_sampled_more_densely(data: Path) -> None:
+    angle, lion = load_shapes(data / "shapes")
+    assert (angle.name, lion.name) == ("angle", "lion")
+    assert len(angle.clean) == 400_000
+    assert (angle.clean != lion.clean).any()
+    columns = {column.name: column for column in COLUMNS if column.subjects == "shapes"}
+    assert {name: len(lion.clouds(column)[1]) for name, column in columns.items()} == {
+        "shapes clean": 100_000,
+        "shapes 0.5 %": 100_000,
+        "shapes 1 %": 100_000,
+        "shapes 2.5 %": 100_000,
+        "shapes 10 k 1 %": 10_000,
+        "shapes 400 k 0.5 %": 400_000,
+    }
+
+
+def test_a_printed_scan_is_measured_against_what_was_printed(data: Path) -> None:
+    (subject,) = load_printed(data / "printed")
+    assert subject.name == "angle"
+    clean, noisy = subject.clouds(Column("printed", 0.001, subjects="printed"))
+    np.testing.assert_array_equal(noisy, PointCloud.read(data / "printed" / "angle_scan.ply").xyz)
+    diagonal = np.linalg.norm(np.ptp(clean, axis=0))
+    expected = 1e3 * point_to_surface(noisy, subject.vertices, subject.faces).mean() / diagonal
+    assert subject.scores(clean, noisy)["p2f"] == pytest.approx(expected, rel=1e-6)
+    assert subject.scores(clean, clean)["p2f"] < 1e-9
+
+
+def test_a_query_costs_what_the_layers_multiply() -> None:
+    layers = {"encoder": [4, 6], "decoder": [5]}
+    assert patch_flops(layers, 10) == 2 * (10 * (3 * 4 + 4 * 6) + 6 * 5 + 5 * 3)
+    assert patch_flops({**layers, "adaptive": True}, 10) == 2 * (10 * (3 * 4 + 4 * 6) + (6 + 5) * 5 + 5 * 8)
 
 
 def run(*arguments: object) -> int:
@@ -145,6 +185,59 @@ def test_other_lengths_of_patch_are_rows_of_their_own(data: Path, bundle_folder:
     filtered, _ = filter_cloud(PointCloud(noisy.copy()), Engine(short), iterations=1)
     assert rows["tiny@8 1"]["cd"] == pytest.approx(subject.scores(clean, filtered.xyz)["cd"], rel=1e-4)
     assert rows["tiny@8 1"]["cd"] != rows["tiny 1"]["cd"]
+
+
+@pytest.mark.parametrize("helping", [0, 1, 6])
+def test_passes_that_the_filter_does_not_make_leave_the_rows_alike(helping: int, engine: Engine) -> None:
+    """An adaptive network that expects to help in the first passes alone, and then says that it does not."""
+    rng = np.random.default_rng(0)
+    noisy = add_noise(crease(400, rng), FINE, rng)
+    calibration = Calibration(balls=(24,), preference=0.0, margin=0.0, passes=6, query_reach=0.0, error_factor=1.0)
+    asked: list[int] = []
+
+    class Network:
+        bundle = dataclasses.replace(engine.bundle, calibration=calibration)
+        threads = 1
+
+        def __call__(self, _p: np.ndarray, told: np.ndarray, queries: np.ndarray, _o: np.ndarray) -> Answers:
+            passes = sum(asked) // len(noisy) + 1  # the one that is being made, once the balls are chosen
+            asked.append(len(queries) if told[0, 1] else 0)
+            helps = helping > 0 and (not told[0, 1] or passes < helping)
+            errors = np.tile(np.float32([-3, -2] if helps else [-2, -3]), (len(queries), 1))
+            return Answers(np.full((len(queries), 3), 0.01, np.float32), errors)
+
+    rows = quality._filtered(noisy, Network())  # type: ignore[arg-type]
+    made = {"1": 1, "2": 2, "4": 4, "auto": 6}
+    most = min(helping + 1, 6) if helping else 0  # one more to see that it does not help
+    assert {name: passes for name, (_, _, passes) in rows.items()} == {
+        name: min(passes, most) for name, passes in made.items()
+    }
+    for name, (points, seconds, passes) in rows.items():
+        moved = np.linalg.norm(points - noisy, axis=1)
+        assert seconds > 0
+        assert (moved.max() > 0) == (helping > 0)
+        assert (points == rows["auto"][0]).all() == (min(passes, helping) == min(6, helping)), name
+
+
+def test_clouds_may_be_named(data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subjects, "SHAPE_POINTS", 12_000)
+    table = data / "table.json"
+    options = ["--data", data, "--models", "--classics", "--json", table, "--columns", "0.5 %", "shapes 10 k 1 %"]
+    options += ["shapes 400 k 0.5 %", "printed"]
+    measured = {
+        ("lion",): {("shapes 10 k 1 %", "lion"), ("shapes 400 k 0.5 %", "lion")},
+        ("angle",): {("shapes 10 k 1 %", "angle"), ("printed", "angle")},  # the densest column is not for all shapes
+        ("crease", "tp"): {("0.5 %", "crease")},
+    }
+    for names, expected in measured.items():
+        table.unlink(missing_ok=True)
+        assert run(*options, "--clouds", *names) == 0
+        rows = json.loads(table.read_text())["rows"]
+        assert {(row["column"], row["cloud"]) for row in rows} == expected
+        assert {row["method"] for row in rows} == {"noisy", "limit"}
+    capsys.readouterr()
+    assert run(*options, "--clouds", "tp") == 2
+    assert "no benchmark data of tp" in capsys.readouterr().err
 
 
 def test_without_data_it_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
