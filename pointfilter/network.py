@@ -65,8 +65,9 @@ def answers(
 ) -> Answers:
     """The network's answers for B patches and M queries sorted by owner, batch by batch; check() is called in between.
 
-    A patch that holds fewer than MIN_NEIGHBOURS points, or all of them at one place, moves nothing: displacement 0.
-    Raises InvalidModelError for an answer of another shape or with values that are not finite.
+    A patch that holds fewer than MIN_NEIGHBOURS points, or all of them at one place, moves nothing: displacement 0,
+    both expected errors the same. Raises InvalidModelError for an answer of another shape or with values that are
+    not finite.
     """
     told = context(counts, later)
     starts = np.searchsorted(owners, np.arange(len(patches) + 1))
@@ -102,6 +103,8 @@ def answers(
             raise InvalidModelError(f"the network answered with shape {values.shape} or values that are not finite")
     nothing = (counts < MIN_NEIGHBOURS) | ~patches.any(axis=(1, 2))
     joined.displacements[nothing[owners]] = 0.0
+    if joined.log_errors is not None:  # the frame of such a patch is arbitrary, and so is what was answered in it
+        joined.log_errors[nothing[owners], 0] = joined.log_errors[nothing[owners], 1]
     return joined
 
 

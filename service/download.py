@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import string
 import unicodedata
 from pathlib import Path
 from urllib.parse import quote
@@ -17,6 +18,7 @@ CHUNK_BYTES = 1 << 18
 MAX_STEM = 100
 NO_NAME = "cloud"
 _ATTR_CHAR = "!#$&+-.^_`|~"  # RFC 8187, beside letters and digits
+_PLAIN = string.punctuation.replace("%", "") + " "  # in X-Warnings as it is; everything else is percent-encoded
 
 
 def content_disposition(file_name: str | None) -> str:
@@ -39,11 +41,18 @@ def _stem(file_name: str) -> str:
 def result_headers(outcome: Outcome, seconds: dict[str, float]) -> dict[str, str]:
     """Of a filtered file. seconds: by stage, before those of the outcome."""
     stages = {**seconds, **outcome.seconds}
+    known = {
+        "X-Moved": outcome.moved,
+        "X-Radius": None if outcome.radius is None else f"{outcome.radius:.9g}",
+        "X-Expected-Error": None if outcome.expected_error is None else f"{outcome.expected_error:.4g}",
+        "X-Warnings": quote("; ".join(outcome.warnings), safe=_PLAIN) or None,
+    }
     return {
         "Server-Timing": ", ".join(f"{stage};dur={1000 * each:.1f}" for stage, each in stages.items()),
         "X-Model": outcome.model,
         "X-Points": str(outcome.points),
         "X-Iterations": str(outcome.iterations),
+        **{name: str(value) for name, value in known.items() if value is not None},
         "ETag": f'"{outcome.sha256}"',
     }
 

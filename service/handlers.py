@@ -19,6 +19,7 @@ from service.problems import problem_response
 log = logging.getLogger("service.problems")
 
 _ROUTING = {404: "not-found", 405: "method-not-allowed"}
+_BOUNDS = ("ge", "gt", "le", "lt", "max_length")  # what pydantic calls the limits of a parameter
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -53,7 +54,10 @@ async def _validation(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)  # noqa: S101
     first = error.errors()[0]
     name = str(first["loc"][-1])
-    told = ParameterError(f"{name}: {first['msg']}", actual=_short(first.get("input")))
+    actual = _short(first.get("input"))
+    got = "" if actual is None else f", got {actual}"
+    limit = next((bound for key, bound in first.get("ctx", {}).items() if key in _BOUNDS), None)
+    told = ParameterError(f"{name}: {first['msg']}{got}", limit=limit, actual=actual)
     return problem_response(request, "parameter-out-of-range", told)
 
 

@@ -24,7 +24,7 @@ async def _order(
     iterations: Annotated[
         str | None,
         Query(
-            description="Most passes over the cloud, a number from 1 on, or auto for as many as help (the default)",
+            description="Most passes over the cloud: a number from 1 on, or auto for the model's own limit (default)",
             json_schema_extra={"pattern": "^(auto|[1-9][0-9]*)$"},
         ),
     ] = None,
@@ -42,10 +42,12 @@ async def _order(
         Query(description="Encoding of the answer"),
     ] = "same",
     strength: Annotated[
-        float, Query(description="Of each displacement: 0 moves nothing, 1 all the way", ge=0, le=1)
+        float,
+        Query(description="Factor of each displacement, from 0 to 1", ge=0, le=1, allow_inf_nan=False),
     ] = 1,
     max_move: Annotated[
-        float | None, Query(description="Longest displacement of a point, in the unit of the file", gt=0)
+        float | None,
+        Query(description="Longest displacement of a point, in the unit of the file", gt=0, allow_inf_nan=False),
     ] = None,
     paper: Annotated[
         bool, Query(description="The paper's mode: balls of 5 % of the bounding box's diagonal, two passes")

@@ -108,8 +108,8 @@ TYPES: dict[str, ProblemType] = {
     ),
     "degenerate-cloud": ProblemType(
         422, "The cloud has no extent", "invalid",
-        "The radius is a share of the cloud's size, and this cloud has no usable size.",
-        "Pass `radius` as a length in the unit of the file, or remove stray points.",
+        "All points are at one place, or so far apart that squared distances exceed double precision.",
+        "Check the coordinates: remove stray points, or pass `radius` as a length in the unit of the file.",
     ),
     "parameter-out-of-range": ProblemType(
         422, "A parameter is out of range", "invalid",

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, field_validator
 
+from pointfilter.models import AUTO
 from service.problems import Problem
 from service.work import Delivery, Order
 
@@ -23,7 +25,10 @@ class State(StrEnum):
 
 
 class Outcome(BaseModel):
-    """Of a job that is done: what goes into the headers of its result."""
+    """Of a job that is done: what goes into the headers of its result.
+
+    Records that earlier versions wrote do not have the fields with defaults.
+    """
 
     sha256: str
     size: int
@@ -31,6 +36,12 @@ class Outcome(BaseModel):
     iterations: int
     model: str
     seconds: dict[str, float]
+    moved: int | None = None
+    radius: float | None = None
+    """Median of the balls, in the unit of the file."""
+    expected_error: float | None = None
+    """None where the network does not tell it."""
+    warnings: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, delivery: Delivery) -> Outcome:
@@ -42,6 +53,10 @@ class Outcome(BaseModel):
             iterations=report.iterations,
             model=report.model,
             seconds=delivery.seconds,
+            moved=report.moved,
+            radius=report.radius,
+            expected_error=report.expected_error,
+            warnings=report.warnings,
         )
 
 
@@ -61,6 +76,14 @@ class Record(BaseModel):
     request_id: str
     outcome: Outcome | None = None
     problem: Problem | None = None
+
+    @field_validator("order", mode="before")
+    @classmethod
+    def _auto_is_none(cls, order: Any) -> Any:
+        """Earlier versions wrote "auto" where this one writes null."""
+        if isinstance(order, dict) and order.get("iterations") == AUTO:
+            return {**order, "iterations": None}
+        return order
 
 
 class Progress(BaseModel):

@@ -52,10 +52,12 @@ still = paper_network(no_displacements)
 
 def adaptive_pooled(patches: np.ndarray, context: np.ndarray, queries: np.ndarray, owners: np.ndarray) -> Answers:
     """An adaptive network without a network. Its answers differ from query to query; the ratio of its errors depends on
-    the points in the ball, on the pass and on the displacement."""
+    the points in the ball and their thickness (thin patches prefer large balls), on the pass and on the displacement.
+    """
     moves = 0.5 * pooled_displacements(patches)[owners] - 0.3 * queries * np.abs(queries[:, 2:])
     lengths = np.sqrt(np.square(moves).sum(axis=1))
-    balls = np.abs(context[owners, 0])
+    thickness = np.abs(patches[:, :, 2]).max(axis=1)
+    balls = np.abs(context[:, 0] + 1.5 * thickness - 0.5)[owners]
     log_errors = np.stack([balls - 2.0 + 0.5 * context[owners, 1], np.log(lengths + 0.1) + 1.0], axis=1)
     return Answers(moves.astype(np.float32), log_errors.astype(np.float32), np.ones_like(queries))
 

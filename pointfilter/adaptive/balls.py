@@ -57,6 +57,8 @@ def choose_balls(
             found = index.ball_radii(probes[chosen], np.tile(sizes, (len(chosen), 1)), reach[probes[chosen]])
             radii[chosen] = found
             there, column = np.nonzero(np.isfinite(found))
+            if not len(there):
+                return
             patches = index.patches(probes[chosen[there]], found[there, column], patch_points, key)
             centres = np.zeros((len(there), 3), np.float32)
             said = answers(network, patches.points, patches.counts, False, centres, np.arange(len(there)), check)

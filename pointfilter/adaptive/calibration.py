@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -38,7 +39,12 @@ class Calibration:
         ):
             raise ValueError(f"calibration: balls must be ascending numbers of points from 4 on, not {balls}")
         numbers = {name: float(values[name]) for name in ("preference", "margin", "query_reach", "error_factor")}
-        if not (0 <= numbers["query_reach"] <= 1 and numbers["error_factor"] > 0 and abs(numbers["preference"]) <= 10):
+        if not (
+            all(map(math.isfinite, numbers.values()))
+            and 0 <= numbers["query_reach"] <= 1
+            and numbers["error_factor"] > 0
+            and abs(numbers["preference"]) <= 10
+        ):
             raise ValueError(f"calibration: out of range: {numbers}")
         passes = values["passes"]
         if type(passes) is not int or not 1 <= passes <= 100:

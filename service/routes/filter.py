@@ -29,7 +29,12 @@ HEADERS = {
     "X-Request-ID": "The caller's, where it sent a sane one",
     "X-Model": "Name of the model that was used",
     "X-Points": "Points in the file",
-    "X-Iterations": "Passes over the cloud; 0: it was found clean and came back as it was",
+    "X-Iterations": "Passes over the cloud",
+    "X-Moved": "Points that were moved; the others have the coordinates that were sent",
+    "X-Radius": "Median radius of the balls, in the unit of the file; 0 where no point took one",
+    "X-Expected-Error": "Mean distance to the surface that the network expects after filtering at full strength, in "
+    "the unit of the file; absent in the paper's mode",
+    "X-Warnings": "What to know before the result is used, percent-encoded, joined by '; '; absent without warnings",
     "ETag": "sha256 of the file",
 }
 _ANSWERS: dict[int | str, dict[str, Any]] = {

@@ -12,6 +12,7 @@ import pytest
 
 from pointfilter import PointCloud
 from pointfilter.evaluation import evaluate
+from pointfilter.models import DEFAULT_MODEL
 from pointfilter.noise import add_noise
 from tests.e2e.conftest import CLEAN, MESH, NOISY, Answer, Server, running_service
 
@@ -19,6 +20,10 @@ from tests.e2e.conftest import CLEAN, MESH, NOISY, Answer, Server, running_servi
 def test_the_example_comes_back_clean(service: Server, tmp_path: Path) -> None:
     answer = service.post("/filter?iterations=2", NOISY.read_bytes())
     assert answer.status == 200, answer.body
+    assert answer.headers["X-Model"] == DEFAULT_MODEL
+    assert int(answer.headers["X-Iterations"]) <= 2
+    assert 0 < int(answer.headers["X-Moved"]) <= int(answer.headers["X-Points"])
+    assert 0 < float(answer.headers["X-Expected-Error"]) < float(answer.headers["X-Radius"])
     result = tmp_path / "clean.ply"
     result.write_bytes(answer.body)
 

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
-from service.download import MAX_STEM, content_disposition
+from service.download import MAX_STEM, content_disposition, result_headers
+from service.records import Outcome
 
 
 @pytest.mark.parametrize(
@@ -57,3 +58,27 @@ def test_any_name_gives_a_harmless_header(name: str) -> None:
 def test_a_name_in_a_form_arrives_in_the_answer(client: TestClient, ply: bytes) -> None:
     answer = client.post("/filter", files={"file": ("Größe.ply", ply)})
     assert answer.headers["content-disposition"].endswith("filename*=UTF-8''Gr%C3%B6%C3%9Fe_filtered.ply")
+
+
+OUTCOME = Outcome(sha256="ab", size=1, points=5, iterations=2, model="tiny", seconds={})
+
+
+def test_headers_of_what_is_not_known_are_absent() -> None:
+    assert result_headers(OUTCOME, {}).keys() == {"Server-Timing", "X-Model", "X-Points", "X-Iterations", "ETag"}
+    known = OUTCOME.model_copy(update={"moved": 0, "radius": 0.0, "expected_error": 0.0})
+    headers = result_headers(known, {})
+    assert (headers["X-Moved"], headers["X-Radius"], headers["X-Expected-Error"]) == ("0", "0", "0")
+    assert "X-Warnings" not in headers
+
+
+@given(st.lists(st.text(min_size=1, max_size=50), min_size=1, max_size=3))
+def test_any_warnings_give_a_harmless_header(warnings: list[str]) -> None:
+    headers = result_headers(OUTCOME.model_copy(update={"warnings": tuple(warnings)}), {})
+    assert headers["X-Warnings"].isascii()
+    assert headers["X-Warnings"].isprintable()
+    assert unquote(headers["X-Warnings"]) == "; ".join(warnings)
+
+
+def test_plain_warnings_stay_readable() -> None:
+    told = "3 rows share places, as where a scanner writes 0 0 0; they were left as they were"
+    assert result_headers(OUTCOME.model_copy(update={"warnings": (told,)}), {})["X-Warnings"] == told

@@ -44,7 +44,7 @@ def ended(client: TestClient, location: str) -> dict[str, Any]:
 
 
 def test_a_job_gives_what_a_request_gives(client: TestClient, ply: bytes, data_dir: Path) -> None:
-    query = "?iterations=2&radius=20%25&seed=5"
+    query = "?iterations=2&radius=20%25&seed=5&strength=0.75&max_move=0.02"
     direct = client.post(f"/filter{query}", files={"file": ("scan.ply", ply)})
     answer = client.post(f"/jobs{query}", files={"file": ("scan.ply", ply)})
     location = answer.headers["location"]
@@ -53,7 +53,8 @@ def test_a_job_gives_what_a_request_gives(client: TestClient, ply: bytes, data_d
     assert status["expires"] > status["finished"] >= status["started"] >= status["created"]
     result = client.get(status["result"])
     assert result.content == direct.content
-    names = ("content-disposition", "x-model", "x-points", "x-iterations", "etag", "content-type", "content-length")
+    names = ("content-disposition", "x-model", "x-points", "x-iterations", "x-moved", "x-radius", "etag",
+             "content-type", "content-length")  # fmt: skip
     assert {name: result.headers[name] for name in names} == {name: direct.headers[name] for name in names}
     assert result.headers["server-timing"].startswith("queue;dur=")
     (folder,) = (data_dir / "jobs").iterdir()
@@ -364,6 +365,39 @@ def accepted(jobs: Jobs, name: str = "", **values: Any) -> Job:
     incoming.source.write_bytes(b"ply")
     order = Order("tiny", None, None, 0, "same")
     return jobs.accept(incoming, Record(id=incoming.id, created=0, order=order, request_id=name, **values))
+
+
+def test_a_job_of_an_earlier_version_is_done(
+    make_settings: Callable[..., Settings], data_dir: Path, ply: bytes
+) -> None:
+    job = accepted(Jobs(data_dir))
+    job.source.write_bytes(ply)
+    (job.folder / "job.json").write_text(json.dumps({
+        "id": job.id, "state": "queued", "created": time.time(), "started": None, "finished": None, "attempts": 0,
+        "order": {"model": "tiny", "iterations": "auto", "radius": None, "seed": 0, "encoding": "same"},
+        "file_name": None, "small": False, "owner": None, "request_id": "r", "outcome": None, "problem": None,
+    }))  # fmt: skip
+    with TestClient(create_app(make_settings())) as client:
+        until(lambda: client.get("/health/ready").status_code == 200)
+        assert ended(client, f"/jobs/{job.id}")["state"] == "done"
+        result = client.get(f"/jobs/{job.id}/result")
+        assert result.content == client.post("/filter", content=ply).content
+
+
+def test_a_result_of_an_earlier_version_can_be_fetched(client: TestClient, ply: bytes, data_dir: Path) -> None:
+    location = begin(client, ply)
+    ended(client, location)
+    path = data_dir / location[1:] / "job.json"
+    record = json.loads(path.read_text())
+    record["order"] = {name: record["order"][name] for name in ("model", "radius", "seed", "encoding")}
+    record["order"]["iterations"] = "auto"
+    names = ("sha256", "size", "points", "iterations", "model", "seconds")
+    record["outcome"] = {name: record["outcome"][name] for name in names}
+    path.write_text(json.dumps(record))
+    result = client.get(f"{location}/result")
+    assert result.status_code == 200
+    assert result.headers["x-iterations"] == "2"
+    assert "x-moved" not in result.headers
 
 
 def test_first_in_first_out_and_small_ones_by_themselves(data_dir: Path) -> None:

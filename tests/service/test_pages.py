@@ -10,6 +10,7 @@ import pytest
 from starlette.testclient import TestClient
 
 import pointfilter
+from pointfilter.models import DEFAULT_MODEL
 
 
 def test_the_page_needs_nothing_from_elsewhere(client: TestClient) -> None:
@@ -72,6 +73,11 @@ def test_models_default_first_and_damaged_ones_left_out(client: TestClient) -> N
     assert re.fullmatch(r"[0-9a-f]{64}", models[0]["sha256"])
     assert [model["provider"] for model in models[:2]] == ["CPUExecutionProvider", None]
     assert models[0]["precision"] == "float32"
+    assert models[0]["calibration"] is None  # the paper's mode
+    adaptive = client.get(f"/models/{DEFAULT_MODEL}").json()
+    assert adaptive["calibration"]["passes"] >= 1
+    assert adaptive["calibration"]["balls"] == sorted(adaptive["calibration"]["balls"])
+    assert not {"radius", "iterations"} & adaptive.keys()
 
 
 def test_version(client: TestClient) -> None:
@@ -87,5 +93,6 @@ def test_openapi_describes_both_ways_to_send_a_file(client: TestClient) -> None:
         "model", "iterations", "radius", "seed", "format", "strength", "max_move", "paper",
     }  # fmt: skip
     assert set(operation["responses"]["200"]["headers"]) == {
-        "Content-Disposition", "Server-Timing", "X-Request-ID", "X-Model", "X-Points", "X-Iterations", "ETag",
+        "Content-Disposition", "Server-Timing", "X-Request-ID", "X-Model", "X-Points", "X-Iterations", "X-Moved",
+        "X-Radius", "X-Expected-Error", "X-Warnings", "ETag",
     }  # fmt: skip

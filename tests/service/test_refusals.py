@@ -45,6 +45,14 @@ PARAMETERS = {
     "radius=" + "9" * 50: (422, "parameter-out-of-range"),
     "seed=-1": (422, "parameter-out-of-range"),
     f"seed={2**63}": (422, "parameter-out-of-range"),
+    "strength=-0.1": (422, "parameter-out-of-range"),
+    "strength=nan": (422, "parameter-out-of-range"),
+    "strength=full": (422, "parameter-out-of-range"),
+    "max_move=0": (422, "parameter-out-of-range"),
+    "max_move=-1": (422, "parameter-out-of-range"),
+    "max_move=inf": (422, "parameter-out-of-range"),
+    "max_move=nan": (422, "parameter-out-of-range"),
+    "paper=perhaps": (422, "parameter-out-of-range"),
     "format=las": (422, "parameter-out-of-range"),
     "model=nobody": (404, "model-not-found"),
     "model=..%2Ftiny": (404, "model-not-found"),
@@ -71,9 +79,23 @@ def test_iterations_are_a_word_or_a_number(client: TestClient, ply: bytes, asked
     assert detail == f"iterations must be auto or a number from 1 to 10, got {asked[:40]}"
 
 
+@pytest.mark.parametrize("path", ["/filter", "/jobs"])
 @pytest.mark.parametrize("query", PARAMETERS)
-def test_bad_parameters(client: TestClient, ply: bytes, query: str) -> None:
-    check(client.post(f"/filter?{query}", content=ply), *PARAMETERS[query])
+def test_bad_parameters(client: TestClient, ply: bytes, path: str, query: str) -> None:
+    check(client.post(f"{path}?{query}", content=ply), *PARAMETERS[query])
+
+
+@pytest.mark.parametrize(
+    ("query", "name", "limit", "actual"),
+    [("strength=2", "strength", 1, "2"), ("max_move=-0.5", "max_move", 0, "-0.5"), ("seed=-1", "seed", 0, "-1")],
+)
+def test_a_parameter_out_of_range_is_told_with_its_limit(
+    client: TestClient, ply: bytes, query: str, name: str, limit: float, actual: str
+) -> None:
+    problem = check(client.post(f"/filter?{query}", content=ply), 422, "parameter-out-of-range")
+    assert (problem["limit"], problem["actual"]) == (limit, actual)
+    assert str(problem["detail"]).startswith(f"{name}: ")
+    assert f" {limit}, got {actual}" in str(problem["detail"])
 
 
 def test_limits_and_knobs_are_named(make_client: Callable[..., TestClient], ply: bytes) -> None:

@@ -15,7 +15,7 @@ from pointfilter.adaptive.places import PLACEHOLDER_ROWS, distinct_places, neigh
 from pointfilter.errors import InvalidModelError
 from pointfilter.filter import filter_points, patch_centres
 from pointfilter.grids import Grids
-from pointfilter.network import Answers
+from pointfilter.network import Answers, Network
 from tests.clouds import adaptive_pooled, pooled_displacements, rotation
 
 CALIBRATION = Calibration(
@@ -47,8 +47,9 @@ def saying(gains: dict[int, float], step: float = 0.01, later: float | None = No
 # --- places ---
 
 
-def test_rows_at_one_place_share_an_answer() -> None:
-    points = plane(500)
+@pytest.mark.parametrize("count", [500, 20_000])
+def test_rows_at_one_place_share_an_answer(count: int) -> None:
+    points = plane(count)
     twice = np.vstack([points, points])
     once = filter_points(points, adaptive_pooled, calibration=CALIBRATION, patch_points=50)
     both = filter_points(twice, adaptive_pooled, calibration=CALIBRATION, patch_points=50)
@@ -137,25 +138,66 @@ def test_a_network_that_does_not_say_its_errors_has_no_use_for_a_calibration() -
 
 def test_where_no_ball_helps_nothing_moves() -> None:
     points = plane(500)
-    calls = 0
     network = saying(dict.fromkeys(CALIBRATION.balls, 0.1))
-
-    def counted(*arguments: np.ndarray) -> Answers:
-        nonlocal calls
-        calls += 1
-        return network(*arguments)
-
-    result = filter_points(points, counted, calibration=CALIBRATION, patch_points=50)
+    result = filter_points(points, network, calibration=CALIBRATION, patch_points=50)
     np.testing.assert_array_equal(result.points, points)
     assert result.passes == 0
     assert not result.moved.any()
 
 
+def test_points_whose_balls_do_not_help_stay_while_others_move() -> None:
+    flat, noisy = plane(1_000, noise=0.0), plane(1_000, seed=1, noise=0.02) + np.array([0, 0, 5])
+
+    def by_thickness(patches: np.ndarray, context: np.ndarray, queries: np.ndarray, owners: np.ndarray) -> Answers:
+        gain = np.where(np.abs(patches[:, :, 2]).max(axis=1) < 1e-3, 0.5, -1.0).astype(np.float32)[owners]
+        moves = np.tile(np.array([0, 0, 0.01], np.float32), (len(owners), 1))
+        return Answers(moves, np.stack([gain, np.zeros_like(gain)], axis=1), moves)
+
+    points = np.vstack([flat, noisy])
+    result = filter_points(points, by_thickness, calibration=CALIBRATION, patch_points=50)
+    np.testing.assert_array_equal(result.points[:1_000], flat)
+    assert result.moved[1_000:].all()
+
+
+def test_each_point_of_a_patch_moves_or_stays_by_its_own_errors() -> None:
+    def near_the_centre(patches: np.ndarray, context: np.ndarray, queries: np.ndarray, owners: np.ndarray) -> Answers:
+        gain = np.where(np.linalg.norm(queries, axis=1) < 0.2, -1.0, 1.0).astype(np.float32)
+        still = np.full_like(gain, -1.0)
+        moves = np.tile(np.array([0, 0, 0.01], np.float32), (len(owners), 1))
+        return Answers(moves, np.stack([still + gain, still], axis=1), moves)
+
+    points = plane(500)
+    result = filter_points(points, near_the_centre, calibration=CALIBRATION, patch_points=50, radius=0.2, iterations=1)
+    assert 0.05 < result.moved.mean() < 0.95
+    np.testing.assert_array_equal(result.points[~result.moved], points[~result.moved])
+    expected = CALIBRATION.error_factor * 0.2 * np.exp(np.where(result.moved, -2.0, -1.0))
+    np.testing.assert_allclose(result.errors, expected, rtol=1e-6)
+
+
+def test_points_without_a_ball_stay_while_others_move() -> None:
+    """40 points so close together, and so far from the rest, that the grid cannot reach the 48th neighbour."""
+    clump = np.array([50.0, 0, 0]) + 1e-4 * np.random.default_rng(1).normal(size=(40, 3))
+    network = saying(dict.fromkeys((48, 96), -1.0))
+    result = filter_points(
+        np.vstack([plane(3_000), clump]),
+        network,
+        calibration=dataclasses.replace(CALIBRATION, balls=(48, 96)),
+        patch_points=50,
+    )
+    assert not result.moved[3_000:].any()
+    assert result.moved[:3_000].mean() > 0.9
+
+
+@pytest.mark.parametrize("radius", [None, 0.2], ids=["balls chosen", "radius given"])
 @pytest.mark.parametrize(("margin", "moves"), [(0.4, True), (0.6, False)])
-def test_the_error_must_fall_by_the_margin(margin: float, moves: bool) -> None:
+def test_the_error_must_fall_by_the_margin(margin: float, moves: bool, radius: float | None) -> None:
     network = saying(dict.fromkeys(CALIBRATION.balls, -0.5))
     result = filter_points(
-        plane(500), network, calibration=dataclasses.replace(CALIBRATION, margin=margin), patch_points=50
+        plane(500),
+        network,
+        calibration=dataclasses.replace(CALIBRATION, margin=margin),
+        patch_points=50,
+        radius=radius,
     )
     assert result.moved.all() == moves
     assert result.moved.any() == moves
@@ -179,11 +221,20 @@ def test_the_filter_ends_when_another_pass_would_not_help() -> None:
     assert filter_points(points, endless, calibration=CALIBRATION, patch_points=50).passes == CALIBRATION.passes
 
 
-def test_progress_has_its_bound_from_the_start_and_never_goes_back() -> None:
+@pytest.mark.parametrize(
+    "network",
+    [
+        adaptive_pooled,
+        saying(dict.fromkeys(CALIBRATION.balls, -1.0), later=0.2),
+        saying(dict.fromkeys(CALIBRATION.balls, 0.1)),
+    ],
+    ids=["some move", "ends early", "no pass"],
+)
+def test_progress_has_its_bound_from_the_start_and_never_goes_back(network: Network) -> None:
     calls: list[tuple[int, int]] = []
     filter_points(
         plane(800),
-        adaptive_pooled,
+        network,
         calibration=CALIBRATION,
         patch_points=50,
         progress=lambda done, total: calls.append((done, total)),
@@ -192,6 +243,18 @@ def test_progress_has_its_bound_from_the_start_and_never_goes_back() -> None:
     assert {call[1] for call in calls} == {CALIBRATION.passes * 800}
     assert done == sorted(done)
     assert done[-1] == CALIBRATION.passes * 800
+
+
+def test_a_ball_with_too_few_points_moves_nothing_whatever_is_expected_of_it() -> None:
+    """Three points have no frame to speak of, so the answer must not decide whether they stay in play."""
+    three = np.array([[9.0, 9, 9], [9.1, 9, 9], [9, 9.1, 9]])
+    network = saying({2: -5.0, 192: -1.0})
+    result = filter_points(
+        np.vstack([plane(500), three]), network, calibration=CALIBRATION, patch_points=50, radius=0.2, iterations=1
+    )
+    np.testing.assert_array_equal(result.points[500:], three)
+    assert result.moved[:500].all()
+    np.testing.assert_allclose(result.errors[500:], CALIBRATION.error_factor * 0.2 * np.exp(-1.0), rtol=1e-6)
 
 
 def test_too_few_points_for_the_smallest_ball_come_back() -> None:
@@ -220,6 +283,29 @@ def test_a_point_s_patch_is_around_a_point_close_by(seed: int, reach: float) -> 
     assert (keys[owners[shared]] < keys[rows[shared]]).all()
 
 
+@pytest.mark.parametrize("reach", [0.0, 0.2, 0.4])
+def test_a_patch_answers_for_points_within_its_reach_and_for_several(reach: float) -> None:
+    distances: list[np.ndarray] = []
+    patches_cut = 0
+
+    def recorded(patches: np.ndarray, context: np.ndarray, queries: np.ndarray, owners: np.ndarray) -> Answers:
+        nonlocal patches_cut
+        distances.append(np.linalg.norm(queries, axis=1))
+        patches_cut += len(patches)
+        return adaptive_pooled(patches, context, queries, owners)
+
+    calibration = dataclasses.replace(CALIBRATION, query_reach=reach)
+    filter_points(plane(2_000), recorded, calibration=calibration, patch_points=50, radius=0.1, iterations=1)
+    asked = np.concatenate(distances)
+    assert len(asked) == 2_000
+    assert asked.max() <= reach + 1e-6
+    if reach == 0:
+        assert patches_cut == 2_000
+    else:
+        assert asked.max() > 0.8 * reach
+        assert patches_cut < 0.7 * 2_000
+
+
 # --- the calibration itself ---
 
 
@@ -232,6 +318,7 @@ def test_a_calibration_survives_json() -> None:
     [
         {"balls": []}, {"balls": [48, 24]}, {"balls": [2, 24]}, {"balls": [24.5]}, {"passes": 0}, {"passes": 1.5},
         {"query_reach": 1.5}, {"error_factor": 0.0}, {"preference": float("nan")}, {"other": 1},
+        {"margin": float("nan")}, {"margin": float("inf")}, {"error_factor": float("inf")},
     ],
 )  # fmt: skip
 def test_a_calibration_out_of_range_is_refused(change: dict[str, object]) -> None:

@@ -15,6 +15,7 @@ from pointfilter.errors import FilteringCancelledError, PointfilterError
 from tests.ply_files import ply_bytes
 
 Capture = pytest.CaptureFixture[str]
+ADAPTIVE = models.DEFAULT_MODEL  # before it is replaced
 
 
 @pytest.fixture(autouse=True)
@@ -62,6 +63,32 @@ def test_options_reach_the_filter(noisy_file: Path, tmp_path: Path, capsys: Capt
         assert report["output"] == str(tmp_path / "a.ply")
         assert (report["iterations"], report["radius"], report["seed"], report["threads"]) == (1, 0.25, 5, 1)
         assert (report["model"], report["provider"], report["points"]) == ("tiny", "CPUExecutionProvider", 600)
+
+
+def test_strength_and_longest_move_reach_the_filter(noisy_file: Path, tmp_path: Path, capsys: Capture) -> None:
+    def largest(*options: object) -> float:
+        assert run("filter", noisy_file, tmp_path / "a.ply", "--json", *options) == 0
+        return float(json.loads(capsys.readouterr().out)["largest_displacement"])
+
+    full = largest()
+    assert largest("--strength", 0.5) == pytest.approx(full / 2)
+    assert largest("--strength", 0) == 0
+    np.testing.assert_array_equal(PointCloud.read(tmp_path / "a.ply").xyz, PointCloud.read(noisy_file).xyz)
+    assert largest("--max-move", full / 3) == pytest.approx(full / 3)
+
+
+def test_the_paper_s_mode_of_an_adaptive_bundle(noisy_file: Path, tmp_path: Path, capsys: Capture) -> None:
+    reports = []
+    for options in ([], ["--paper"]):
+        assert (
+            run("filter", noisy_file, tmp_path / "a.ply", "--json", "--model", models.BUNDLES / ADAPTIVE, *options) == 0
+        )
+        reports.append(json.loads(capsys.readouterr().out))
+    adaptive, paper = reports
+    assert adaptive["expected_error"] > 0
+    assert adaptive["radius_low"] < adaptive["radius_high"]
+    assert (paper["iterations"], paper["expected_error"]) == (2, None)
+    assert paper["radius_low"] == paper["radius_high"]
 
 
 def test_iterations_may_be_left_to_the_cloud(noisy_file: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -133,6 +160,8 @@ def test_another_encoding(encoding: str, noisy_file: Path, tmp_path: Path) -> No
         ("--iterations", 0, "from 1 to 100, got 0"),
         ("--iterations", 101, "from 1 to 100, got 101"),
         ("--seed", -1, "seed must be from 0"),
+        ("--strength", 1.5, "strength must be from 0 to 1"),
+        ("--max-move", -1, "max_move must be a length above 0"),
         ("--threads", -1, "threads must be from 0"),
         ("--device", "tpu", "auto, cpu, openvino"),
     ],

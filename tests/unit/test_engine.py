@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -17,6 +18,10 @@ from pointfilter.engine import DEVICES, MAX_THREADS, Device, available_cpus
 from pointfilter.errors import InvalidModelError, ParameterError, ProviderUnavailableError
 from pointfilter.models import load_bundle
 from pointfilter.network import Answers
+
+CALIBRATION = {
+    "balls": [24, 48], "preference": 0.1, "margin": 0.0, "passes": 3, "query_reach": 0.4, "error_factor": 1.2,
+}  # fmt: skip
 
 
 def displacements(engine: Engine, patches: np.ndarray) -> np.ndarray:
@@ -136,6 +141,25 @@ def test_answers_have_a_row_a_patch_at_any_length(engine: Engine) -> None:
         assert (np.abs(answer) <= 1).all()
 
 
+def test_an_adaptive_bundle_answers_every_query_from_its_owner_s_patch(default_engine: Engine) -> None:
+    rng = np.random.default_rng(0)
+    patches = rng.uniform(-1, 1, (3, 40, 3)).astype(np.float32)
+    context = np.array([[0, 0], [0.5, 0], [0, 1]], np.float32)
+    queries = rng.uniform(-0.3, 0.3, (7, 3)).astype(np.float32)
+    owners = np.array([0, 0, 0, 1, 2, 2, 2])
+    together = default_engine(patches, context, queries, owners)
+    assert together.log_errors is not None
+    assert together.normals is not None
+    assert (together.displacements.shape, together.log_errors.shape, together.normals.shape) == ((7, 3), (7, 2), (7, 3))
+    for row, owner in enumerate(owners):
+        alone = default_engine(patches[[owner]], context[[owner]], queries[[row]], np.array([0]))
+        for one, all_of_them in zip(alone, together, strict=True):
+            np.testing.assert_allclose(one[0], all_of_them[row], rtol=0, atol=1e-5)
+    assert (together.displacements[0] != together.displacements[1]).any()  # another query, the same patch
+    elsewhere = default_engine(patches, context, queries, np.array([0, 0, 1, 1, 2, 2, 2]))
+    assert (together.displacements[2] != elsewhere.displacements[2]).any()  # the same query, another patch
+
+
 def test_padding_with_the_centre_changes_nothing(engine: Engine) -> None:
     patches = np.random.default_rng(0).uniform(-1, 1, (5, 20, 3)).astype(np.float32)
     patches[:, 0] = 0
@@ -177,25 +201,40 @@ def test_weights_that_are_no_graph(bundle: ModelBundle, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("inputs", "shape"),
-    [(["patches", "more"], ["b", "n", 3]), (["patches"], ["b", 3, "n"]), (["patches"], ["b", "n", 4])],
+    ("inputs", "output", "shape", "calibration", "message"),
+    [
+        (["patches", "more"], "displacements", ["b", "n", 3], None, "has inputs"),
+        (["patches"], "out", ["b", "n", 3], None, "has inputs"),
+        (["patches"], "displacements", ["b", "n", 3], CALIBRATION, "has inputs"),
+        (["patches"], "displacements", ["b", 3, "n"], None, "takes no patches"),
+        (["patches"], "displacements", ["b", "n", 4], None, "takes no patches"),
+    ],
 )
-def test_a_graph_with_another_door(inputs: list[str], shape: list[object], bundle_folder: Path, tmp_path: Path) -> None:
+def test_a_graph_with_another_door(
+    inputs: list[str],
+    output: str,
+    shape: list[object],
+    calibration: dict[str, object] | None,
+    message: str,
+    bundle_folder: Path,
+    tmp_path: Path,
+) -> None:
     """A valid bundle whose graph takes something else fails when it is loaded or warmed up, as an InvalidModelError."""
     onnx = pytest.importorskip("onnx")
     helper, kind = onnx.helper, onnx.TensorProto.FLOAT
-    nodes = [helper.make_node("ReduceMax", ["patches"], ["out"], axes=[1], keepdims=0)]
+    nodes = [helper.make_node("ReduceMax", ["patches"], [output], axes=[1], keepdims=0)]
     graph = helper.make_graph(
         nodes,
         "other",
         [helper.make_tensor_value_info(name, kind, shape) for name in inputs],
-        [helper.make_tensor_value_info("out", kind, None)],
+        [helper.make_tensor_value_info(output, kind, None)],
     )
     serialised = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8).SerializeToString()
     described = json.loads((bundle_folder / "model.json").read_text())
     described["sha256"] = hashlib.sha256(serialised).hexdigest()
+    described["calibration"] = calibration
     (tmp_path / "model.onnx").write_bytes(serialised)
     (tmp_path / "model.json").write_text(json.dumps(described))
     bundle = load_bundle(tmp_path)
-    with pytest.raises(InvalidModelError, match=tmp_path.name):
+    with pytest.raises(InvalidModelError, match=f"{re.escape(tmp_path.name)}.* {message}"):
         Engine(bundle, "cpu").warm_up()

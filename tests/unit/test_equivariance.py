@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pointfilter import Engine
+from pointfilter import Engine, Filtered
+from pointfilter import filter as filter_module
 from pointfilter import network as network_module
 from pointfilter.adaptive.calibration import Calibration
 from tests.clouds import adaptive_pooled, crease, filter_points, pooled, rotation
@@ -158,14 +161,26 @@ def test_row_order_threads_and_batches_change_no_bit_of_the_adaptive_mode(
 
 
 def test_a_piece_with_a_margin_gives_the_same_bits_as_the_whole() -> None:
-    """Every choice is local: what lies further away than some balls has no influence."""
+    """Every choice is local: what lies further away than some balls has no influence. The piece is cut out of the
+    middle, so that rows, probes and the bounding box of the two differ; the noise of the cloud varies along it, and
+    with it the balls."""
     rng = np.random.default_rng(5)
-    points = np.column_stack([rng.uniform(0, 20, 8_000), rng.uniform(0, 2, 8_000), 0.02 * rng.normal(size=8_000)])
-    whole = adapted(points, origin=np.zeros(3))
-    piece = points[:, 0] < 14
-    inside = points[piece][:, 0] < 6
-    assert (whole != points).any(axis=1).mean() > 0.5
-    np.testing.assert_array_equal(adapted(points[piece], origin=np.zeros(3))[inside], whole[piece][inside])
+    x, y, z = rng.uniform(0, 24, 9_600), rng.uniform(0, 2, 9_600), rng.normal(size=9_600)
+    points = np.column_stack([x, y, (0.01 + 0.2 * np.sin(x) ** 2) * z])
+    piece, inner = (x > 4) & (x < 20), (x > 9.5) & (x < 14.5)
+
+    def choose_and_filter(cloud: np.ndarray, calibration: Calibration = CALIBRATION) -> Filtered:
+        return filter_module.filter_points(
+            cloud, adaptive_pooled, calibration=calibration, patch_points=24, origin=np.zeros(3)
+        )
+
+    whole, part = choose_and_filter(points), choose_and_filter(points[piece])
+    largest = choose_and_filter(points, dataclasses.replace(CALIBRATION, balls=CALIBRATION.balls[-1:]))
+    low, high = np.percentile(whole.radii[inner] / largest.radii[inner], (10, 90))
+    assert high > 1.5 * low  # there are choices to make
+    assert 0.5 < whole.moved[inner].mean() < 1
+    for name in ("points", "radii", "errors", "normals"):
+        np.testing.assert_array_equal(getattr(part, name)[inner[piece]], getattr(whole, name)[inner], err_msg=name)
 
 
 # --- with onnxruntime, whose products may add in another order for another batch ---

@@ -111,8 +111,24 @@ def test_which_neighbours_a_full_patch_keeps_depends_on_the_key_and_is_fair() ->
     assert kept[1:].std() < 2 * np.sqrt(300 * 0.1 * 0.9)
 
 
-def test_mixing_is_the_native_code_s() -> None:
-    values = np.array([0, 1, 2**63], dtype=np.uint64)
-    mixed_values = mixed(values)
-    assert mixed_values[0] == 0
-    assert len(set(mixed_values.tolist())) == 3
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+def test_mixing_is_the_finaliser_of_splitmix64() -> None:
+    """Its first three numbers from seed 0, as published with the generator."""
+    found = mixed(np.arange(1, 4, dtype=np.uint64) * GOLDEN)
+    assert found.tolist() == [0xE220A8397B1DCDAF, 0x6E789E6AA1B965F4, 0x06C45D188009454F]
+
+
+@given(seed=st.integers(0, 2**32), key=st.integers(0, 2**64 - 1))
+def test_a_full_patch_keeps_the_smallest_hashes_of_the_distances(seed: int, key: int) -> None:
+    """The native choice is this one, with the same mixing."""
+    points = np.random.default_rng(seed).uniform(-1, 1, (300, 3))
+    patch = NeighbourIndex(points, 1.0).patches(np.array([0]), np.array([4.0]), 40, key)
+    steps = (np.square(points - points[0]).sum(axis=1) * (2**12 / 16.0)).astype(np.uint64)
+    hashes = mixed(mixed(np.array([key], np.uint64)) + steps * GOLDEN)
+    hashes[0] = 0
+    squared = np.square(points - points[0]).sum(axis=1)
+    expected = np.lexsort((squared, hashes))[:40]
+    _, found = cKDTree(points).query(patch.points[0].astype(np.float64) @ patch.frames[0] * 4.0 + points[0])
+    assert sorted(found) == sorted(expected)
