@@ -20,10 +20,10 @@ from tests.e2e.conftest import CLEAN, MESH, NOISY, Answer, Server, running_servi
 def test_the_example_comes_back_clean(service: Server, tmp_path: Path) -> None:
     answer = service.post("/filter?iterations=2", NOISY.read_bytes())
     assert answer.status == 200, answer.body
-    assert answer.headers["X-Model"] == DEFAULT_MODEL
-    assert int(answer.headers["X-Iterations"]) <= 2
-    assert 0 < int(answer.headers["X-Moved"]) <= int(answer.headers["X-Points"])
-    assert 0 < float(answer.headers["X-Expected-Error"]) < float(answer.headers["X-Radius"])
+    assert answer.headers["x-model"] == DEFAULT_MODEL
+    assert int(answer.headers["x-iterations"]) <= 2
+    assert 0 < int(answer.headers["x-moved"]) <= int(answer.headers["x-points"])
+    assert 0 < float(answer.headers["x-expected-error"]) < float(answer.headers["x-radius"])
     result = tmp_path / "clean.ply"
     result.write_bytes(answer.body)
 
