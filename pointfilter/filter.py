@@ -99,8 +99,8 @@ def filter_points(
     in the paper's mode. iterations: most passes. patch_points: N, what the network was trained with. seed: of the
     downsampling. threads: how many batches are evaluated at once; the result does not depend on it. origin: subtracted
     from the coordinates, by default the middle of the bounding box; pieces of one cloud must share it.
-    progress(done, total) is called from this thread and never goes backwards. cancelled() is asked between batches,
-    from any thread. after_pass(passes, points) sees the points after every pass.
+    progress(done, total) is called from this thread, in rows times passes, and never goes backwards. cancelled() is
+    asked between batches, from any thread. after_pass(passes, points) sees the points after every pass.
 
     Raises TooFewPointsError, DegenerateCloudError, ParameterError, FilteringCancelledError.
     """
@@ -143,7 +143,7 @@ def filter_points(
         kept[moved] = state.points[places.rows[moved]] + origin  # what did not move does not lose a digit
         return kept
 
-    total = passes * len(state.points)
+    total = passes * len(points)
     made = 0
     for iteration in range(passes):
         if not state.moving.any():
@@ -152,7 +152,7 @@ def filter_points(
 
         def report(done: int, before: int = iteration * len(state.points) + arrived) -> None:
             if progress is not None:
-                progress(before + done, total)
+                progress((before + done) * len(points) // len(state.points), total)
 
         report(0)
         _one_pass(state, iteration, network, calibration, patch_points, seed, threads, report, check, clock)
@@ -243,7 +243,8 @@ def _one_pass(
             if calibration is not None and said.log_errors is not None:
                 log_moved, log_still = said.log_errors.astype(np.float64).T
                 better = log_still - log_moved > calibration.margin
-                state.errors[asked] = np.exp(np.where(better, log_moved, log_still)) * radii[:, 0]
+                errors = np.exp(np.where(better, log_moved, log_still)) * radii[:, 0]
+                state.errors[asked] = np.where(patches.counts[patch] < MIN_NEIGHBOURS, np.nan, errors)
                 state.moving[asked] = better
             if said.normals is not None:
                 normals = np.einsum("mi,mij->mj", said.normals.astype(np.float64), frames)

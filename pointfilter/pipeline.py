@@ -67,7 +67,8 @@ class Report:
     radius_high: float
     """5th and 95th percentile of the balls."""
     expected_error: float | None
-    """Mean distance to the surface that the network expects of the filtered points; None where it does not say."""
+    """Mean distance to the surface that the network expects of the filtered points; None where it does not say, and
+    where `strength` or `max_move` limits the displacements."""
     seed: int
     mean_displacement: float
     largest_displacement: float
@@ -155,7 +156,7 @@ def filter_cloud(
         radius=middle,
         radius_low=low,
         radius_high=high,
-        expected_error=float(result.errors[told].mean()) if told.any() else None,
+        expected_error=float(result.errors[told].mean()) if told.any() and filtered is result.points else None,
         seed=seed,
         mean_displacement=float(displacements.mean()),
         largest_displacement=float(displacements.max()),

@@ -32,8 +32,8 @@ HEADERS = {
     "X-Iterations": "Passes over the cloud",
     "X-Moved": "Points that were moved; the others have the coordinates that were sent",
     "X-Radius": "Median radius of the balls, in the unit of the file; 0 where no point took one",
-    "X-Expected-Error": "Mean distance to the surface that the network expects after filtering at full strength, in "
-    "the unit of the file; absent in the paper's mode",
+    "X-Expected-Error": "Mean distance to the surface that the network expects of the filtered points, in "
+    "the unit of the file; absent in the paper's mode and with a limit on displacements",
     "X-Warnings": "What to know before the result is used, percent-encoded, joined by '; '; absent without warnings",
     "ETag": "sha256 of the file",
 }
