@@ -133,6 +133,7 @@ def filter_points(
             state.radii[:], gains = choose_balls(
                 places.points, keys, reach, network, calibration, patch_points, key, threads, check
             )
+        state.radii[np.isinf(state.radii)] = np.nan  # there is no ball
         state.moving[gains > -calibration.margin] = False  # no ball helps there
     else:
         state.moving[:] = False

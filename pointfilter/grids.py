@@ -14,6 +14,7 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 ROWS_PER_TASK = 4_096
+SMALLEST_EDGE = 1e-150  # its square is still a number
 
 
 class Grids:
@@ -26,7 +27,7 @@ class Grids:
     def by_radius(self, rows: Int64, radii: Float64) -> Iterator[tuple[Int64, NeighbourIndex]]:
         """Splits the points `rows` (q,) by the power of two below their radii (q,): yields positions in `rows`, in the
         order of the index, and an index whose cells are one to two of them wide."""
-        octaves = np.floor(np.log2(radii)).astype(np.int64)
+        octaves = np.floor(np.log2(np.maximum(radii, SMALLEST_EDGE))).astype(np.int64)
         for octave in np.unique(octaves):
             if octave not in self._indexes:
                 self._indexes[octave] = NeighbourIndex(self.points, float(2.0**octave))

@@ -26,6 +26,7 @@ from pointfilter.errors import ParameterError
 EMPTY_CELLS = 64  # a wider gap between cells along an axis is narrowed to this many; more than a ball may reach
 MAX_REACH = 63  # edges of a cell: no ball may be larger (kMaxReach in the native code)
 MAX_CELLS_PER_AXIS = 2**20  # three of them fit the 63 bits of a cell's key
+LARGEST_CELL = 2.0**50  # number of a cell before gaps are narrowed: exact in double precision
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -52,8 +53,8 @@ class Patches:
 class NeighbourIndex:
     """A grid over a cloud that answers which points lie within a given distance of one of them.
 
-    points: (n, 3) float64, finite. edge: of a cell, in the same unit; balls of one to four edges are answered fastest,
-    those of more than MAX_REACH edges not at all.
+    points: (n, 3) float64, finite. edge: of a cell, in the same unit, larger where the cloud would have too many cells;
+    balls of one to four edges are answered fastest, those of more than MAX_REACH edges not at all.
 
     The points are kept sorted by cell, then by coordinates; `order[k]` is the row in `points` of the k-th one,
     `positions` the inverse, and centres that come in this order are answered fastest. Cells are anchored at the origin
@@ -63,8 +64,7 @@ class NeighbourIndex:
     def __init__(self, points: Float64, edge: float) -> None:
         if not (np.isfinite(edge) and edge > 0):
             raise ParameterError(f"the edge of a cell must be a finite number above 0, got {edge!r}")
-        self.edge = float(edge)
-        cells = np.stack([_narrowed(np.floor(points[:, axis] / self.edge)) for axis in range(3)], axis=1)
+        self.edge, cells = _cells(points, float(edge))
         shape = (cells.max(axis=0) + 1) if len(points) else np.ones(3, dtype=np.int64)
         keys = (cells[:, 2] * shape[1] + cells[:, 1]) * shape[0] + cells[:, 0]
         self.order: Int64 = np.lexsort((points[:, 2], points[:, 1], points[:, 0], keys)).astype(np.int64)
@@ -112,20 +112,28 @@ class NeighbourIndex:
         return self.order[owners]
 
 
+def _cells(points: Float64, edge: float) -> tuple[float, Int64]:
+    """The edge, and the cells (n, 3) of the points along each axis from 0 on.
+
+    The edge is doubled until there are at most MAX_CELLS_PER_AXIS: a few points that lie far closer together than all
+    others must not make the grid large.
+    """
+    largest = float(np.abs(points).max(initial=0.0))
+    while edge * LARGEST_CELL < largest:
+        edge *= 2
+    while True:
+        cells = np.stack([_narrowed(np.floor(points[:, axis] / edge)) for axis in range(3)], axis=1)
+        if cells.max(initial=0) < MAX_CELLS_PER_AXIS:
+            return edge, cells
+        edge *= 2
+
+
 def _narrowed(cells: Float64) -> Int64:
     """Cell numbers along one axis from 0 on, with gaps wider than EMPTY_CELLS narrowed: a few points far away must not
-    make the grid large. Raises ParameterError where even so there are too many cells."""
+    make the grid large."""
     names, inverse = np.unique(cells, return_inverse=True)
     steps = np.minimum(np.diff(names, prepend=names[:1]), EMPTY_CELLS)
-    numbers = np.cumsum(steps).astype(np.int64)
-    if len(numbers) and numbers[-1] >= MAX_CELLS_PER_AXIS:
-        raise ParameterError(
-            f"the radius is too small for the cloud: {numbers[-1] + 1} cells along one axis",
-            limit=MAX_CELLS_PER_AXIS,
-            actual=int(numbers[-1]) + 1,
-            hint="give a larger radius",
-        )
-    narrowed: Int64 = numbers[inverse]
+    narrowed: Int64 = np.cumsum(steps).astype(np.int64)[inverse]
     return narrowed
 
 

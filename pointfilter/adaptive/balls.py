@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from pointfilter.adaptive.calibration import Calibration
 from pointfilter.errors import InvalidModelError
-from pointfilter.grids import Grids
+from pointfilter.grids import SMALLEST_EDGE, Grids
 from pointfilter.network import Network, answers
 from pointfilter.patches import NeighbourIndex, UInt64
 from pointfilter.ranges import over_ranges
@@ -55,6 +55,7 @@ def choose_balls(
         def evaluate(first: int, last: int, rows: Int64 = rows, index: NeighbourIndex = index) -> None:
             chosen = rows[first:last]
             found = index.ball_radii(probes[chosen], np.tile(sizes, (len(chosen), 1)), reach[probes[chosen]])
+            found = np.where(found > 0, found, np.inf)  # squares of such distances have no digits left
             radii[chosen] = found
             there, column = np.nonzero(np.isfinite(found))
             if not len(there):
@@ -71,7 +72,7 @@ def choose_balls(
     tree = cKDTree(points[probes])
     _, near = tree.query(points[probes], k=np.arange(1, min(SMOOTHED, len(probes)) + 1), workers=threads)
     gains = gains[near].mean(axis=1)
-    doublings = np.log2(np.where(np.isfinite(radii), radii, 1.0) / reach[probes][:, None])
+    doublings = np.log2(np.where(np.isfinite(radii), radii, 1.0) / np.maximum(reach[probes], SMALLEST_EDGE)[:, None])
     wanted = gains + calibration.preference * doublings
     best = len(sizes) - 1 - np.argmin(wanted[:, ::-1], axis=1)  # the larger at a tie
     rows = np.arange(len(probes))

@@ -345,3 +345,16 @@ def test_no_error_is_expected_where_balls_hold_too_few_points() -> None:
     result = filter_points(plane(500), adaptive_pooled, calibration=CALIBRATION, patch_points=50, radius=0.01)
     assert np.isnan(result.errors).mean() > 0.9
     assert not result.moved[np.isnan(result.errors)].any()
+
+
+@pytest.mark.parametrize("size", [1e-200, 1e-9, 1e-4])
+def test_a_tight_clump_does_not_stop_the_filter(size: float) -> None:
+    points = plane(20_000)
+    clump = np.array([0.5, 0.5, 0.0]) if size > 1e-100 else np.zeros(3)
+    points = np.vstack([points, clump + size * np.random.default_rng(1).normal(size=(30, 3))])
+    result = filter_points(
+        points, saying(dict.fromkeys(CALIBRATION.balls, -1.0)), calibration=CALIBRATION, patch_points=50, iterations=1,
+        origin=np.zeros(3),
+    )  # fmt: skip
+    assert np.isfinite(result.points).all()
+    assert result.moved[:20_000].mean() > 0.9

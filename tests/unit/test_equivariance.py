@@ -176,9 +176,9 @@ def test_a_piece_with_a_margin_gives_the_same_bits_as_the_whole() -> None:
         )
 
     whole, part = choose_and_filter(points), choose_and_filter(points[piece])
-    largest = choose_and_filter(points, dataclasses.replace(CALIBRATION, balls=CALIBRATION.balls[-1:]))
-    low, high = np.percentile(whole.radii[inner] / largest.radii[inner], (10, 90))
-    assert high > 1.1 * low  # 1 where all points choose alike
+    for ball in CALIBRATION.balls:  # there are choices to make: no one ball is that of nearly all points
+        alike = choose_and_filter(points, dataclasses.replace(CALIBRATION, balls=(ball,)))
+        assert (whole.radii[inner] == alike.radii[inner]).mean() < 0.9
     assert 0.5 < whole.moved[inner].mean() < 1
     for name in ("points", "radii", "errors", "normals"):
         np.testing.assert_array_equal(getattr(part, name)[inner[piece]], getattr(whole, name)[inner], err_msg=name)

@@ -71,11 +71,15 @@ def test_an_edge_that_is_none(edge: float) -> None:
         NeighbourIndex(np.zeros((3, 3)), edge)
 
 
-def test_a_grid_with_too_many_cells_is_refused() -> None:
+def test_a_grid_with_too_many_cells_gets_larger_ones() -> None:
     points = np.zeros((2**15, 3))
     points[:, 0] = np.arange(2**15)
-    with pytest.raises(ParameterError, match="radius is too small"):
-        NeighbourIndex(points, 1e-3)
+    index = NeighbourIndex(points, 1e-3)
+    assert 1e-3 < index.edge < 1
+    rows = np.arange(1, 200)
+    counts = index.patches(rows, np.full(199, 1.5), 1, 0).counts
+    np.testing.assert_array_equal(counts, 3)
+    assert NeighbourIndex(points, 1e-140).edge < 1
 
 
 def test_a_piece_of_a_cloud_is_sorted_as_the_whole() -> None:
