@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 
 from export.calibration import calibrate
 from export.checkpoint import Loaded
-from export.graph import OPSET, build, encoder_ranges
+from export.graph import OPSET, build, encoder_ranges, graph_network
 from pointfilter.models import FRAME, NAME, NAME_RULE, SCHEMA, ModelBundle, load_bundle
 from training.dataset import Batch, DataSettings, TrainingCloud, cut_batch, training_clouds
 from training.own import as_network
@@ -107,24 +106,15 @@ def _rounded(loaded: Loaded, exact: bytes) -> tuple[bytes, float]:
     """The int8 graph, and by how much it changes displacements of other patches, as a share of their mean length."""
     ranges = encoder_ranges(loaded.network, typical_batch(loaded.patch_points, 0).patches.numpy())
     serialised = build(loaded.network, ranges).SerializeToString()
-    others = typical_batch(loaded.patch_points, 1)
-    expected, answers = (_answers(graph, others)["displacements"] for graph in (exact, serialised))
+    others = _asked(typical_batch(loaded.patch_points, 1))
+    expected, answers = (graph_network(graph)(*others).displacements for graph in (exact, serialised))
     lengths = np.linalg.norm(expected, axis=1)
     return serialised, float(np.linalg.norm(answers - expected, axis=1).mean() / max(lengths.mean(), 1e-12))
 
 
-def _answers(serialised: bytes, batch: Batch) -> dict[str, NDArray[np.float32]]:
-    """What a serialised graph answers, by the names of its outputs."""
-    session = onnxruntime.InferenceSession(serialised, providers=["CPUExecutionProvider"])
-    given = _inputs(batch)
-    names = [entry.name for entry in session.get_outputs()]
-    found = session.run(names, {entry.name: given[entry.name] for entry in session.get_inputs()})
-    return dict(zip(names, found, strict=True))
-
-
-def _inputs(batch: Batch) -> dict[str, NDArray[Any]]:
-    tensors = {"patches": batch.patches, "context": batch.context, "queries": batch.queries, "owners": batch.owners}
-    return {name: tensor.numpy() for name, tensor in tensors.items()}
+def _asked(batch: Batch) -> tuple[NDArray[Any], ...]:
+    """What a network is called with."""
+    return tuple(tensor.numpy() for tensor in (batch.patches, batch.context, batch.queries, batch.owners))
 
 
 @cache
@@ -163,12 +153,11 @@ def _exchange(partial: Path, folder: Path) -> None:
 def parity_error(loaded: Loaded, serialised: bytes) -> float:
     """Largest difference between the answers of torch and onnxruntime, over real patches of several lengths and
     batches: that of displacements, or of log_errors and normals relative to their size where it is above 1."""
+    network = graph_network(serialised)
     differences = []
     for length in (1, 7, loaded.patch_points // 2, loaded.patch_points):
-        batch = typical_batch(length, 2, PARITY_PATCHES)
-        given = _inputs(batch)
-        expected = as_network(loaded.network)(*(given[name] for name in ("patches", "context", "queries", "owners")))
-        for name, found in _answers(serialised, batch).items():
-            wanted = getattr(expected, name)
-            differences.append((np.abs(found - wanted) / np.maximum(np.abs(wanted), 1)).max())
+        asked = _asked(typical_batch(length, 2, PARITY_PATCHES))
+        for found, expected in zip(network(*asked), as_network(loaded.network)(*asked), strict=True):
+            if found is not None and expected is not None:
+                differences.append((np.abs(found - expected) / np.maximum(np.abs(expected), 1)).max())
     return float(np.max(differences))  # NaN where any answer is

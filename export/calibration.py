@@ -5,16 +5,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 
+from export.graph import graph_network
 from pointfilter.adaptive.calibration import Calibration
-from pointfilter.engine import ADAPTIVE_OUTPUTS
 from pointfilter.filter import Filtered, filter_points
 from pointfilter.metrics import point_to_surface
-from pointfilter.network import Answers, Network
+from pointfilter.network import Network
 from training.own import UNCALIBRATED
 from training.scanning import scan
 from training.shapes import Mesh, random_shape
@@ -40,12 +40,18 @@ class _Cloud:
 
 def calibrate(serialised: bytes, patch_points: int) -> Calibration:
     """The calibration of a serialised adaptive graph."""
-    network = _network(serialised)
+    network = graph_network(serialised)
     noisy = [_cloud(number, LEVELS[number % len(LEVELS)]) for number in range(CLOUDS)]
+
+    @cache
+    def measured(calibration: Calibration) -> list[tuple[Float64, Float64]]:
+        """Distances that are left and that are expected, of every cloud."""
+        filtered = [_filtered(cloud, network, calibration, patch_points) for cloud in noisy]
+        return [(_distances(*pair), pair[1].errors[_measured(pair[1])]) for pair in zip(noisy, filtered, strict=True)]
 
     def cost(calibration: Calibration) -> float:
         """Mean logarithm of the distance that is left, as a share of the noise."""
-        left = [_distances(cloud, _filtered(cloud, network, calibration, patch_points)).mean() for cloud in noisy]
+        left = [distances.mean() for distances, _ in measured(calibration)]
         return float(np.mean(np.log(left) - np.log([cloud.level for cloud in noisy])))
 
     chosen = min((dataclasses.replace(UNCALIBRATED, preference=preference) for preference in PREFERENCES), key=cost)
@@ -54,13 +60,11 @@ def calibrate(serialised: bytes, patch_points: int) -> Calibration:
         larger = dataclasses.replace(chosen, margin=margin)
         if cost(larger) <= least + MOST_LOSS:
             chosen = larger
-    factors = []
-    for cloud in noisy:
-        filtered = _filtered(cloud, network, chosen, patch_points)
-        expected = filtered.errors[_measured(filtered)]
-        told = np.isfinite(expected)
-        if told.any():  # the network may have left the cloud alone
-            factors.append(np.log(_distances(cloud, filtered)[told].mean() / expected[told].mean()))
+    factors = [
+        np.log(distances[told].mean() / expected[told].mean())
+        for distances, expected in measured(chosen)
+        if (told := np.isfinite(expected)).any()  # the network may have left the cloud alone
+    ]
     return dataclasses.replace(chosen, error_factor=float(np.exp(np.mean(factors))) if factors else 1.0)
 
 
@@ -83,18 +87,3 @@ def _measured(filtered: Filtered) -> NDArray[np.int64]:
     """Rows of at most MEASURED_POINTS points, spread over the cloud."""
     count = len(filtered.points)
     return np.linspace(0, count - 1, min(count, MEASURED_POINTS)).astype(np.int64)
-
-
-def _network(serialised: bytes) -> Network:
-    session = onnxruntime.InferenceSession(serialised, providers=["CPUExecutionProvider"])
-
-    def ask(
-        patches: NDArray[np.float32],
-        context: NDArray[np.float32],
-        queries: NDArray[np.float32],
-        owners: NDArray[np.int64],
-    ) -> Answers:
-        given = {"patches": patches, "context": context, "queries": queries, "owners": owners}
-        return Answers(*session.run(ADAPTIVE_OUTPUTS, given))
-
-    return ask

@@ -22,10 +22,13 @@ from typing import Any
 
 import numpy as np
 import onnx
+import onnxruntime
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
+from pointfilter.engine import session_network
+from pointfilter.network import Network
 from training.network import CONTEXT, Pointfilter
 
 OPSET = 17
@@ -200,6 +203,11 @@ def _queried(graph: _Graph, features: str, matrix: Float64, bias: Float64) -> st
     patch = graph.node("Gather", [patch, "owners"], "decoder0_gathered", axis=0)
     query = graph.product("queries", matrix[width : width + 3], bias, "decoder0_query")
     return graph.node("Add", [patch, query], "decoder0")
+
+
+def graph_network(serialised: bytes) -> Network:
+    """A serialised graph as the callable that the filter expects, on the CPU."""
+    return session_network(onnxruntime.InferenceSession(serialised, providers=["CPUExecutionProvider"]))
 
 
 def encoder_ranges(network: Pointfilter, patches: NDArray[np.float32]) -> list[float]:

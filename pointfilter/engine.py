@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from pointfilter.errors import InvalidModelError, ParameterError, ProviderUnavailableError
 from pointfilter.models import ModelBundle
-from pointfilter.network import Answers
+from pointfilter.network import Answers, Network
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
@@ -88,31 +87,29 @@ class Engine:
         if hashlib.sha256(weights).hexdigest() != bundle.sha256:
             raise InvalidModelError(f"model.onnx of {bundle.name!r} changed after it was checked")
         try:
-            self._session = onnxruntime.InferenceSession(
+            session = onnxruntime.InferenceSession(
                 weights, options, providers=[chosen.provider], provider_options=[provider_options]
             )
         except Exception as error:  # onnxruntime's own tree differs between versions and providers
             raise InvalidModelError(f"onnxruntime cannot load model {bundle.name!r}: {_first_line(error)}") from error
-        self.provider: str = self._session.get_providers()[0]
+        self.provider: str = session.get_providers()[0]
         if self.provider != chosen.provider:
             raise ProviderUnavailableError(
                 f"{chosen.provider} was asked for and {self.provider} came up",
                 hint="see the log of onnxruntime for the reason",
             )
-        inputs = {entry.name for entry in self._session.get_inputs()}
-        self._outputs = [entry.name for entry in self._session.get_outputs()]
-        self._adaptive = bundle.calibration is not None
-        if inputs != (ADAPTIVE_INPUTS if self._adaptive else {"patches"}) or self._outputs != (
-            ADAPTIVE_OUTPUTS if self._adaptive else ADAPTIVE_OUTPUTS[:1]
+        inputs = {entry.name for entry in session.get_inputs()}
+        outputs = [entry.name for entry in session.get_outputs()]
+        adaptive = bundle.calibration is not None
+        if inputs != (ADAPTIVE_INPUTS if adaptive else {"patches"}) or outputs != (
+            ADAPTIVE_OUTPUTS if adaptive else ADAPTIVE_OUTPUTS[:1]
         ):
-            raise InvalidModelError(f"model {bundle.name!r} has inputs {sorted(inputs)} and outputs {self._outputs}")
+            raise InvalidModelError(f"model {bundle.name!r} has inputs {sorted(inputs)} and outputs {outputs}")
+        self._network = session_network(session)
 
     def __call__(self, patches: Float32, context: Float32, queries: Float32, owners: Int64) -> Answers:
-        given: dict[str, NDArray[Any]] = {"patches": patches}
-        if self._adaptive:
-            given |= {"context": context, "queries": queries, "owners": owners}
         with self._turn:
-            return Answers(*self._session.run(self._outputs, given))
+            return self._network(patches, context, queries, owners)
 
     def warm_up(self) -> None:
         """One real inference; raises InvalidModelError when the answer is not what the bundle promises."""
@@ -125,6 +122,17 @@ class Engine:
         for values, width in zip(answer, (3, 2, 3), strict=True):
             if values is not None and (values.shape != (2, width) or not np.isfinite(values).all()):
                 raise InvalidModelError(f"model {self.bundle.name!r} answered a test patch with shape {values.shape}")
+
+
+def session_network(session: onnxruntime.InferenceSession) -> Network:
+    """The session of a graph that export wrote, the paper's or an adaptive one, as a network."""
+    inputs = {entry.name for entry in session.get_inputs()}
+
+    def ask(patches: Float32, context: Float32, queries: Float32, owners: Int64) -> Answers:
+        given = {"patches": patches, "context": context, "queries": queries, "owners": owners}
+        return Answers(*session.run(None, {name: given[name] for name in inputs}))
+
+    return ask
 
 
 def _choose(device: str) -> str:

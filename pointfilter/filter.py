@@ -21,8 +21,8 @@ from pointfilter.errors import DegenerateCloudError, FilteringCancelledError, Pa
 from pointfilter.grids import Grids
 from pointfilter.network import MIN_NEIGHBOURS, Network, answers, patches_per_batch
 from pointfilter.noise import bounding_box_diagonal
-from pointfilter.patches import NeighbourIndex, UInt64, mixed, sampling_key
-from pointfilter.ranges import over_ranges
+from pointfilter.patches import SMALLEST_RADIUS, NeighbourIndex, UInt64, mixed, sampling_key
+from pointfilter.ranges import numbers_of_ranges, over_ranges
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -31,7 +31,6 @@ Bool = NDArray[np.bool_]
 DEFAULT_RADIUS = 0.05  # of the bounding-box diagonal, in the paper's mode (§3.2)
 DEFAULT_ITERATIONS = 2  # in the paper's mode
 MAX_ITERATIONS = 100
-SMALLEST_RADIUS = 1e-150  # its square is still a number
 STAGES = ("index", "balls", "patches", "infer")
 BATCHES_PER_TASK = 8  # batches that a worker cuts in one go, so that workers seldom meet at the interpreter's lock
 
@@ -230,7 +229,7 @@ def _one_pass(
             part = chosen[first:last]
             with clock.measure("patches"):
                 patches = index.patches(centres[part], state.radii[centres[part]], patch_points, key)
-                patch, asked = _ranges(starts[part], sizes[part])
+                patch, asked = numbers_of_ranges(starts[part], sizes[part])
                 asked = rows[asked]
                 frames, radii = patches.frames[patch], patches.radii[patch][:, None]
                 queries = np.einsum("mij,mj->mi", frames, before[asked] - before[centres[part][patch]]) / radii
@@ -258,12 +257,6 @@ def _one_pass(
             done += answered
             report(done)
     state.points = after
-
-
-def _ranges(starts: Int64, sizes: Int64) -> tuple[Int64, Int64]:
-    """For ranges of `sizes` numbers from `starts` on, one after the other: the range each number is of, the number."""
-    which = np.repeat(np.arange(len(sizes)), sizes)
-    return which, np.arange(len(which)) + (starts - np.cumsum(sizes) + sizes)[which]
 
 
 def patch_centres(

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pointfilter.errors import InvalidModelError
+from pointfilter.ranges import numbers_of_ranges
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -76,17 +77,9 @@ def answers(
         for start in range(0, len(positions), patches_per_batch(length)):
             check()
             batch = positions[start : start + patches_per_batch(length)]
-            asked = starts[batch + 1] - starts[batch]
-            rows = np.arange(asked.sum()) + np.repeat(starts[batch] - np.cumsum(asked) + asked, asked)
+            owner, rows = numbers_of_ranges(starts[batch], starts[batch + 1] - starts[batch])
             order.append(rows)
-            parts.append(
-                network(
-                    np.ascontiguousarray(patches[batch, :length]),
-                    told[batch],
-                    queries[rows],
-                    np.repeat(np.arange(len(batch)), asked),
-                )
-            )
+            parts.append(network(np.ascontiguousarray(patches[batch, :length]), told[batch], queries[rows], owner))
     back = np.argsort(np.concatenate(order))
 
     def in_order(values: list[Float32 | None]) -> Float32 | None:

@@ -24,6 +24,7 @@ from pointfilter import _native
 from pointfilter.errors import ParameterError
 
 EMPTY_CELLS = 64  # a wider gap between cells along an axis is narrowed to this many; more than a ball may reach
+SMALLEST_RADIUS = 1e-150  # its square is still a number
 MAX_REACH = 63  # edges of a cell: no ball may be larger (kMaxReach in the native code)
 MAX_CELLS_PER_AXIS = 2**20  # three of them fit the 63 bits of a cell's key
 LARGEST_CELL = 2.0**50  # number of a cell before gaps are narrowed: exact in double precision
@@ -105,10 +106,11 @@ class NeighbourIndex:
         return radii
 
     def smallest_key(self, rows: Int64, radii: Float64, keys: UInt64) -> Int64:
-        """For the points `rows` (q,): the row of the point with the smallest key within radii (q,). keys: (n,)."""
+        """For the points `rows` (q,): the row of the point with the smallest key within radii (q,). keys: (n,), in
+        the order of `order`."""
         owners = np.empty(len(rows), dtype=np.int64)
         radii = np.ascontiguousarray(radii, dtype=np.float64)
-        _native.smallest_key(self._arrays, self.positions[rows], radii, keys[self.order], owners)
+        _native.smallest_key(self._arrays, self.positions[rows], radii, keys, owners)
         return self.order[owners]
 
 

@@ -17,6 +17,7 @@ from prometheus_client import (
 )
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 
+from pointfilter.filter import STAGES as FILTER_STAGES
 from service.admission import Admission
 from service.exchange import Exchange
 from service.problem_types import TYPES, Outcome
@@ -24,7 +25,7 @@ from service.work import Delivery
 from service.worker import Loaded
 
 MEDIA_TYPE = CONTENT_TYPE_LATEST
-STAGES = ("parse", "index", "balls", "patches", "infer", "write")
+STAGES = ("parse", *FILTER_STAGES, "write")
 SECONDS = (0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60, 120, 300, 600)
 STAGE_SECONDS = (0.001, 0.005, 0.01, 0.05, 0.1, 0.5, 1, 5, 10, 30, 60, 300, 600)
 POINTS = (1e3, 1e4, 5e4, 1e5, 2.5e5, 5e5, 1e6, 2.5e6, 5e6, 1e7)

@@ -19,6 +19,7 @@ from starlette.requests import Request
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import FilteringCancelledError, InputError, LimitExceededError
+from pointfilter.filter import STAGES
 from pointfilter.formats.ply_header import read_header
 from pointfilter.limits import ReadLimits
 from pointfilter.pipeline import Radius, Report, filter_cloud
@@ -88,7 +89,7 @@ def carry_out(
         progress=lambda done, total: progress(done, total, points),
         cancelled=stopped,
     )
-    seconds.update({stage: report.seconds[stage] for stage in ("index", "balls", "patches", "infer")})
+    seconds.update({stage: report.seconds[stage] for stage in STAGES})
     _go_on(stopped)
     started = time.perf_counter()
     filtered.write(target, order.encoding, report.comment)

@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 
 from pointfilter.adaptive.calibration import Calibration
 from pointfilter.errors import InvalidModelError
-from pointfilter.grids import SMALLEST_EDGE, Grids
+from pointfilter.grids import Grids
 from pointfilter.network import Network, answers
-from pointfilter.patches import NeighbourIndex, UInt64
+from pointfilter.patches import SMALLEST_RADIUS, NeighbourIndex, UInt64
 from pointfilter.ranges import over_ranges
 
 Float64 = NDArray[np.float64]
@@ -67,12 +67,13 @@ def choose_balls(
                 raise InvalidModelError("the network has a calibration and answers without expected errors")
             gains[chosen[there], column] = said.log_errors[:, 0] - said.log_errors[:, 1]
 
-        over_ranges(evaluate, len(rows), PROBES_PER_TASK, threads, check)
+        for _ in over_ranges(evaluate, len(rows), PROBES_PER_TASK, threads, check):
+            pass
 
     tree = cKDTree(points[probes])
     _, near = tree.query(points[probes], k=np.arange(1, min(SMOOTHED, len(probes)) + 1), workers=threads)
     gains = gains[near].mean(axis=1)
-    doublings = np.log2(np.where(np.isfinite(radii), radii, 1.0) / np.maximum(reach[probes], SMALLEST_EDGE)[:, None])
+    doublings = np.log2(np.where(np.isfinite(radii), radii, 1.0) / np.maximum(reach[probes], SMALLEST_RADIUS)[:, None])
     wanted = gains + calibration.preference * doublings
     best = len(sizes) - 1 - np.argmin(wanted[:, ::-1], axis=1)  # the larger at a tie
     rows = np.arange(len(probes))

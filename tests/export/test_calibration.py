@@ -57,7 +57,7 @@ def staying(_patches: np.ndarray, _context: np.ndarray, queries: np.ndarray, _ow
 
 def of(network: Network, monkeypatch: pytest.MonkeyPatch) -> Calibration:
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_network", lambda _: network)
+        patch.setattr(module, "graph_network", lambda _: network)
         return calibrate(b"", patch_points=32)
 
 

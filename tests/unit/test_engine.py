@@ -7,6 +7,7 @@ import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -73,19 +74,18 @@ def test_a_provider_gets_its_options(bundle: ModelBundle, monkeypatch: pytest.Mo
 def test_a_device_that_takes_one_call_at_a_time_gets_one(bundle: ModelBundle, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(engine_module.DEVICES, "shy", Device("CPUExecutionProvider", one_call_at_a_time=True))
     engine = Engine(bundle, "shy", threads=4)
-    session = engine._session
+    network = engine._network
     running, most = 0, 0
 
-    class Watched:
-        def run(self, *arguments: object) -> object:
-            nonlocal running, most
-            running += 1
-            most = max(most, running)
-            answer = session.run(*arguments)
-            running -= 1
-            return answer
+    def watched(*arguments: Any) -> Answers:
+        nonlocal running, most
+        running += 1
+        most = max(most, running)
+        answer = network(*arguments)
+        running -= 1
+        return answer
 
-    engine._session = Watched()
+    engine._network = watched
     patches = np.random.default_rng(0).uniform(-1, 1, (50, 64, 3)).astype(np.float32)
     with ThreadPoolExecutor(4) as pool:
         answers = list(pool.map(lambda one: displacements(engine, one), [patches] * 20))

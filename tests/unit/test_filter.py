@@ -212,6 +212,21 @@ def test_progress_only_rises_and_ends_at_the_total(
     assert callers == {threading.get_ident()}
 
 
+def test_progress_comes_while_the_work_goes_on(noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network_module, "ROWS_PER_BATCH", 500)
+    evaluated = 0
+    seen: set[int] = set()
+
+    @paper_network
+    def counted(patches: np.ndarray) -> np.ndarray:
+        nonlocal evaluated
+        evaluated += len(patches)
+        return pooled_displacements(patches)
+
+    filter_points(noisy_crease, counted, iterations=1, progress=lambda _done, _total: seen.add(evaluated))
+    assert len(seen - {0, len(noisy_crease)}) > 3
+
+
 @pytest.mark.parametrize("threads", [1, 3])
 def test_cancellation_stops_after_the_batches_under_way(
     threads: int, noisy_crease: np.ndarray, monkeypatch: pytest.MonkeyPatch
