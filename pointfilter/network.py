@@ -73,7 +73,7 @@ def answers(
     told = context(counts, later)
     starts = np.searchsorted(owners, np.arange(len(patches) + 1))
     order, parts = [], []
-    for length, positions in _by_length(counts, patches.shape[1]):
+    for length, positions in by_length(counts, patches.shape[1]):
         for start in range(0, len(positions), patches_per_batch(length)):
             check()
             batch = positions[start : start + patches_per_batch(length)]
@@ -101,7 +101,7 @@ def answers(
     return joined
 
 
-def _by_length(counts: Int64, longest: int) -> Iterator[tuple[int, Int64]]:
+def by_length(counts: Int64, longest: int) -> Iterator[tuple[int, Int64]]:
     """Groups patches by the length they need: yields (length, positions), lengths rounded up to LENGTH_STEP.
 
     Evaluating a patch at its own length is exact (the padding is the centre point once more) and saves the rest.

@@ -2,12 +2,13 @@
 
     python -m training                                      # the default preset, on procedural shapes
     python -m training --resume                             # after a kill, a reboot, a night
+    python -m training --resume --steps 200000              # longer than it was to be
     python -m training --preset smoke                       # the whole chain in minutes
     python -m training --out runs/mine --meshes my_scans/   # your own ply, obj, off, stl
     python -m training --out runs/mine --set data.noise_high=0.01 --set steps=20000
 
-The folder (runs/PRESET unless --out says another) then holds checkpoint.pt (for `python -m export`), log.csv (the
-curve) and settings.json.
+The folder (runs/PRESET unless --out says another) then holds checkpoint.pt (for `python -m export`), stable.pt (from
+where the run can be made longer), log.csv (the curve) and settings.json.
 """
 
 from __future__ import annotations
@@ -41,6 +42,9 @@ def parser() -> argparse.ArgumentParser:
         "--resume",
         action="store_true",
         help="go on from the folder's checkpoint, exactly, with its settings: takes neither --set nor --seed",
+    )
+    parser.add_argument(
+        "--steps", type=int, metavar="N", help="with --resume: make the run longer or shorter than it was to be"
     )
     parser.add_argument("--init", type=Path, metavar="CHECKPOINT", help="start from the weights of this checkpoint.pt")
     parser.add_argument("--until", type=int, metavar="STEP", help="stop after this step, with a checkpoint")
@@ -109,6 +113,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if options.resume and overrides:
             raise ValueError("--resume takes its settings from the checkpoint: leave out --set and --seed")
+        if options.steps is not None and not options.resume:
+            raise ValueError("--steps changes a run that is resumed; for a new one: --set steps=N")
         if options.resume and not (folder / "checkpoint.pt").is_file():
             raise FileNotFoundError(f"--resume: no checkpoint.pt in {folder}")
         settings = load_preset(options.preset, overrides)
@@ -122,6 +128,7 @@ def main(arguments: list[str] | None = None) -> int:
                 clouds=options.clouds,
                 init=init,
                 until=options.until,
+                steps=options.steps,
                 stop=stopped,
             )
     except (ValueError, OSError) as error:

@@ -100,14 +100,15 @@ class TrainingCloud:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """B patches and M queries. patches: (B, N, 3) float32. context: (B, 2), see network.context. queries: (M, 3)
-    float32, in the frames of their patches. owners: (M,) int64, their patches. still: (M,), distance of a query to the
-    surface.
+    """B patches and M queries. patches: (B, N, 3) float32. counts: (B,) int64, points in their balls. context: (B, 2),
+    see network.context. queries: (M, 3) float32, in the frames of their patches. owners: (M,) int64, their patches.
+    still: (M,), distance of a query to the surface.
 
     clouds: (B,), the number of the cloud of each patch. centres: (B, 3), frames: (B, 3, 3) and radii: (B,), float64.
     """
 
     patches: Tensor
+    counts: Tensor
     context: Tensor
     queries: Tensor
     owners: Tensor
@@ -246,6 +247,7 @@ def cut_batch(clouds: Sequence[TrainingCloud], settings: DataSettings, step: int
     queries, owners = _queries(points, joined(counts), settings, rng)
     batch = Batch(
         patches=torch.from_numpy(points),
+        counts=torch.from_numpy(joined(counts)),
         context=context(
             torch.from_numpy(np.maximum(joined(counts), 1)),
             torch.tensor([clouds[number].later for number in numbers_of]),

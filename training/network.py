@@ -15,6 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from pointfilter.network import by_length
+
 CONTEXT = 5  # inputs of the decoder beside the features: the query's place (3), points in the ball, a later pass or not
 ANSWERS = 8  # displacement (3), two logarithms of errors, normal (3)
 GATHERED_VALUES = 2**20  # how much the pooled layer's backward gathers at once: what the caches hold
@@ -26,7 +28,7 @@ class NetworkSettings:
 
     encoder: tuple[int, ...] = (64, 64, 128, 384)
     """Widths of the shared layers, from the coordinates up to the patch's feature vector."""
-    decoder: tuple[int, ...] = (512, 256)
+    decoder: tuple[int, ...] = (768, 384)
     """Widths of the layers between the feature vector and the displacement."""
     norm_after_pool: bool = True
     """The last encoder layer's BatchNorm and ReLU after the max instead of before it, as in the paper.
@@ -108,28 +110,42 @@ class Pointfilter(nn.Module):
         """Each decoder layer with its normalisation; `head` comes after them."""
         return _pairs(self.decoder, self.decoder_norms)
 
-    def encode(self, patches: Tensor) -> Tensor:
-        """The feature vectors (B, C) of patches (B, N, 3)."""
+    def encode(self, patches: Tensor, counts: Tensor | None = None) -> Tensor:
+        """The feature vectors (B, C) of patches (B, N, 3). counts: (B,) int64, points in their balls; rows that are
+        padding cost nothing then."""
         batch, points, _ = patches.shape
-        rows = patches.reshape(batch * points, 3)
+        groups = [(points, torch.arange(batch))]
+        if counts is not None:
+            groups = [(length, torch.from_numpy(group)) for length, group in by_length(counts.numpy(), points)]
+        rows = torch.cat([patches[group, :length].reshape(-1, 3) for length, group in groups])
         *inner, last = self.encoder_layers()
         for layer, norm in inner:
             rows = functional.relu(norm(layer(rows)))
         layer, norm = last
-        if self.settings.norm_after_pool:
-            # The bias is the same for all points, so it commutes with the max.
-            pooled: Tensor = _PooledLinear.apply(rows, layer.weight.to(rows.dtype), batch)  # type: ignore[no-untyped-call]
-            return functional.relu(norm(pooled.float() + layer.bias))
-        return functional.relu(norm(layer(rows))).view(batch, points, -1).amax(dim=1)
+        if not self.settings.norm_after_pool:
+            rows = functional.relu(norm(layer(rows)))
+        pooled = []
+        parts = torch.split(rows, [length * len(group) for length, group in groups])
+        for part, (_, group) in zip(parts, groups, strict=True):
+            if self.settings.norm_after_pool:
+                pooled.append(_PooledLinear.apply(part, layer.weight.to(part.dtype), len(group)))  # type: ignore[no-untyped-call]
+            else:
+                pooled.append(part.view(len(group), -1, part.shape[1]).amax(dim=1))
+        features = torch.cat(pooled)[torch.argsort(torch.cat([group for _, group in groups]))]
+        if self.settings.norm_after_pool:  # the bias is the same for all points, so it commutes with the max
+            features = functional.relu(norm(features.float() + layer.bias))
+        return features
 
     def forward(self, patches: Tensor) -> Tensor:
         """The paper's network: displacements (B, 3) of the centres."""
         return torch.tanh(self._decode(self.encode(patches)))
 
-    def answer(self, patches: Tensor, queries: Tensor, owners: Tensor, context: Tensor) -> Answers:
+    def answer(
+        self, patches: Tensor, queries: Tensor, owners: Tensor, context: Tensor, counts: Tensor | None = None
+    ) -> Answers:
         """The adaptive network. queries: (M, 3), points of the patches `owners` (M,) int64 in their frames.
-        context: (B, 2), see `context`."""
-        values = self._decode(self.encode(patches), queries, owners, context)
+        context: (B, 2), see `context`. counts: see `encode`."""
+        values = self._decode(self.encode(patches, counts), queries, owners, context)
         return Answers(torch.tanh(values[:, :3]), values[:, 3], values[:, 4], values[:, 5:])
 
     def _decode(

@@ -49,7 +49,7 @@ def _typed(key: str, old: Any, new: Any, source: str) -> Any:
         return float(new)
     if isinstance(old, tuple | list):
         kind = type(old[0]) if old else float
-        if isinstance(new, list) and new and all(type(entry) is kind for entry in new):
+        if isinstance(new, list) and all(type(entry) is kind for entry in new):
             return new
         raise ValueError(f"{source}: {key} must be a list of {kind.__name__}, not {new!r}")
     if type(new) is not type(old):

@@ -33,10 +33,11 @@ from training.network import NetworkSettings, Pointfilter
 from training.own import own_clouds
 
 CHECKPOINT_VERSION = 2
+STABLE = "stable.pt"  # the checkpoint from before the learning rate fell
 CURVE = ("step", "loss", "distance", "validation_loss", "validation_distance")  # what a record keeps of the history
 
 OPTIMIZERS = ("adamw", "sgd")
-SCHEDULES = ("one-cycle", "exponential")
+SCHEDULES = ("warmup-stable-decay", "exponential")
 PRECISIONS = ("auto", "bfloat16", "float32")
 
 
@@ -47,14 +48,20 @@ class TrainingSettings:
     network: NetworkSettings = field(default_factory=NetworkSettings)
     data: DataSettings = field(default_factory=DataSettings)
     loss: LossSettings = field(default_factory=LossSettings)
-    steps: int = 60_000
-    own_from: tuple[float, ...] = (0.25, 0.6)
-    """Shares of the run after which the network filters training clouds anew: later passes see its own outputs."""
+    steps: int = 200_000
+    own_from: tuple[int, ...] = (12_000, 30_000, 75_000, 180_000)
+    """Steps after which the network filters training clouds anew: later passes see its own outputs."""
     optimizer: str = "adamw"
     """adamw (default) or sgd (the paper's, §3.4)."""
     learning_rate: float = 2e-3
-    schedule: str = "one-cycle"
-    """one-cycle (default) or exponential: from learning_rate down to final_learning_rate, as in the paper."""
+    schedule: str = "warmup-stable-decay"
+    """warmup-stable-decay (default): constant, then down to 0 in a line over the last `decay` of the run, so that a run
+    that has not come so far can be made longer. exponential: from learning_rate down to final_learning_rate, as in the
+    paper."""
+    warmup: int = 1_000
+    """Steps over which the learning rate rises."""
+    decay: float = 0.25
+    """Share of the run over which the learning rate falls."""
     final_learning_rate: float = 1e-8
     weight_decay: float = 1e-4
     gradient_clip: float = 1.0
@@ -82,8 +89,18 @@ class TrainingSettings:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, not {', '.join(found)}")
         if (self.loss.loss == "surface") != self.network.adaptive:
             raise ValueError("the loss 'surface' and network.adaptive need each other")
+        for name, widths in (("encoder", self.network.encoder), ("decoder", self.network.decoder)):
+            if not widths:
+                raise ValueError(f"network.{name} must have at least one layer")
+        if not 0 < self.decay <= 1:
+            raise ValueError(f"decay must be above 0 and at most 1, not {self.decay}")
         if not self.network.adaptive and self.data.queries != 1:
             raise ValueError("data.queries must be 1 for a network that is not adaptive")
+
+    @property
+    def decay_from(self) -> int:
+        """The step from which on the learning rate depends on the length of the run."""
+        return 0 if self.schedule == "exponential" else round(self.steps * (1 - self.decay))
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrainingSettings:
@@ -97,9 +114,11 @@ class TrainingSettings:
 
 
 class Run:
-    """A training run in a folder: checkpoint.pt (everything), log.csv (the loss curve), settings.json."""
+    """A training run in a folder: checkpoint.pt (everything), stable.pt (the same before the learning rate falls),
+    log.csv (the loss curve), settings.json."""
 
-    def __init__(self, folder: Path, settings: TrainingSettings, resume: bool) -> None:
+    def __init__(self, folder: Path, settings: TrainingSettings, state: dict[str, Any] | None = None) -> None:
+        """state: of the checkpoint to go on from; None starts anew."""
         self.folder = folder
         self.settings = settings
         torch.manual_seed(settings.seed)
@@ -118,8 +137,8 @@ class Run:
         """Records of the runs that the first weights came from."""
         self.source: dict[str, str] = {}
         """Where the user's own data is: "meshes" or "clouds" and the folder. Empty for procedural shapes."""
-        if resume:
-            self._load(folder / "checkpoint.pt")
+        if state is not None:
+            self._load(state)
         else:
             folder.mkdir(parents=True, exist_ok=True)
             for left in folder.glob("own-*.npz"):  # by a run that ended before its first checkpoint
@@ -136,19 +155,20 @@ class Run:
         parameters, rate, decay = self.network.parameters(), self.settings.learning_rate, self.settings.weight_decay
         if self.settings.optimizer == "sgd":
             return torch.optim.SGD(parameters, rate, momentum=0.9, weight_decay=decay)
-        return torch.optim.AdamW(parameters, rate, weight_decay=decay)
+        return torch.optim.AdamW(parameters, rate, weight_decay=decay, fused=True)
 
     def _scheduler(self) -> torch.optim.lr_scheduler.LRScheduler:
         settings = self.settings
         if settings.schedule == "exponential":
             gamma = (settings.final_learning_rate / settings.learning_rate) ** (1 / settings.steps)
             return torch.optim.lr_scheduler.ExponentialLR(self.optimizer, gamma)
-        return torch.optim.lr_scheduler.OneCycleLR(
-            self.optimizer, settings.learning_rate, total_steps=settings.steps + 1, pct_start=0.15, cycle_momentum=False
-        )
 
-    def _load(self, path: Path) -> None:
-        state = torch.load(path, weights_only=True)
+        def factor(step: int) -> float:
+            return min(1.0, (step + 1) / (settings.warmup + 1), (1 - step / settings.steps) / settings.decay)
+
+        return torch.optim.lr_scheduler.LambdaLR(self.optimizer, factor)
+
+    def _load(self, state: dict[str, Any]) -> None:
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
@@ -173,12 +193,14 @@ class Run:
             "optimizer": self.optimizer.state_dict(),
             "scheduler": self.scheduler.state_dict(),
         }
-        partial = self.folder / "checkpoint.pt.partial"
-        with partial.open("wb") as file:
-            torch.save(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(self.folder / "checkpoint.pt")
+        stable = self.step == self.settings.decay_from
+        for name in (STABLE, "checkpoint.pt") if stable else ("checkpoint.pt",):
+            partial = self.folder / f"{name}.partial"
+            with partial.open("wb") as file:
+                torch.save(state, file)
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(self.folder / name)
         if self.history:
             partial = self.folder / "log.csv.partial"
             with partial.open("w", newline="") as text:
@@ -196,7 +218,7 @@ class Run:
         validation = [validation_cloud(number, settings.data) for number in range(settings.validation_clouds)]
         self.network.train()
         progress = tqdm(initial=self.step, total=settings.steps, unit="batch", smoothing=0.05)
-        own_at = [round(share * settings.steps) for share in settings.own_from] if settings.network.adaptive else []
+        own_at = settings.own_from if settings.network.adaptive else ()
         while self.step < last and not stop():
             started = max((step for step in own_at if step <= self.step), default=None)
             own = [] if started is None else self._own_clouds(started, clouds)
@@ -248,7 +270,7 @@ class Run:
                 self.recent.clear()
                 self.history.append(row)
                 progress.write("  ".join(f"{name} {value:.6g}" for name, value in row.items()))
-            if self.step % settings.checkpoint_every == 0:
+            if self.step % settings.checkpoint_every == 0 or self.step == settings.decay_from:
                 self.save()
 
     def _loss(
@@ -261,7 +283,7 @@ class Run:
             near = clean_patches(batch, clouds, settings.data, step)
             loss = filtering_loss(displacements, *near, settings.loss, progress=step / settings.steps)
             return loss.mean(), loss.mean().item()
-        answers = network.answer(batch.patches, batch.queries, batch.owners, batch.context)
+        answers = network.answer(batch.patches, batch.queries, batch.owners, batch.context, batch.counts)
         moved = batch.queries + answers.displacements
         nearest, normals, spacing = nearest_on_surface(batch, clouds, moved)
         loss, left = adaptive_loss(answers, nearest, normals, batch.still, batch.queries, spacing, settings.loss)
@@ -318,6 +340,21 @@ def _use_bfloat16(precision: str) -> bool:
     return precision == "bfloat16"
 
 
+def _of_another_length(
+    folder: Path, saved: dict[str, Any], settings: TrainingSettings, steps: int
+) -> tuple[dict[str, Any], TrainingSettings]:
+    """The checkpoint and the settings with which a run goes on to another number of steps."""
+    longer = dataclasses.replace(settings, steps=steps)
+    if saved["step"] > min(settings.decay_from, longer.decay_from) and (folder / STABLE).exists():
+        saved = torch.load(folder / STABLE, weights_only=True)
+    if saved["step"] > min(settings.decay_from, longer.decay_from):
+        raise ValueError(
+            f"a run of {steps} steps lowers its learning rate from step {longer.decay_from} on, one of "
+            f"{settings.steps} from step {settings.decay_from} on: the checkpoint of step {saved['step']} is too late"
+        )
+    return saved, longer
+
+
 def start(
     folder: Path,
     settings: TrainingSettings,
@@ -327,17 +364,22 @@ def start(
     clouds: Path | None = None,
     init: dict[str, Any] | None = None,
     until: int | None = None,
+    steps: int | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Run:
     """Starts or resumes a run and trains it to its end (or to step `until`, or until stop(), asked between batches).
 
+    steps: another length for a run that is resumed; the result is that of a run with this length from the start.
     init: the checkpoint where the weights come from. Raises ValueError where its network has other settings,
     FileExistsError where the folder holds another run, KeyboardInterrupt when stopped before the first batch.
     """
     first = None if init is None else trained_network(init)
+    saved = None
     if resume:
         saved = torch.load(folder / "checkpoint.pt", weights_only=True)
         settings = TrainingSettings.from_dict(saved["settings"])
+        if steps is not None:
+            saved, settings = _of_another_length(folder, saved, settings, steps)
     elif (folder / "checkpoint.pt").exists():
         raise FileExistsError(f"{folder} holds a run already: go on with --resume, or choose another folder with --out")
     if first is not None:
@@ -345,7 +387,7 @@ def start(
             raise ValueError("weights to start from are for a new run; this one goes on from its own checkpoint")
         if first.settings != settings.network:
             raise ValueError(f"the weights to start from do not fit the network: {first.settings}, {settings.network}")
-    run = Run(folder, settings, resume)
+    run = Run(folder, settings, saved)
     if meshes or clouds or not resume:
         run.source = {name: str(path.absolute()) for name, path in (("meshes", meshes), ("clouds", clouds)) if path}
     meshes, clouds = (Path(run.source[name]) if name in run.source else None for name in ("meshes", "clouds"))

@@ -157,3 +157,23 @@ def test_a_query_s_answer_does_not_depend_on_the_others() -> None:
         alone = network.answer(patches[2:3], queries[4:5], torch.tensor([0]), told[2:3])
     for one, all_of_them in zip(alone, expected, strict=True):
         torch.testing.assert_close(one[0], all_of_them[4], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("norm_after_pool", [True, False])
+def test_a_patch_is_evaluated_at_its_own_length(norm_after_pool: bool) -> None:
+    torch.manual_seed(0)
+    network = Pointfilter(NetworkSettings((8, 16), (8,), norm_after_pool))
+    counts = torch.tensor([3, 32, 33, 64, 200, 0])
+    patches = torch.randn(6, 64, 3)
+    for patch, count in zip(patches, counts, strict=True):
+        patch[count:] = 0.0  # as pointfilter.patches pads them; a row of zeros is the centre once more
+    patches[:, 0] = 0.0
+    network.train()
+    seen = []
+    network.encoder[0].register_forward_hook(lambda _, given, __: seen.append(len(given[0])))
+    network.encode(patches, counts)
+    assert seen == [3 * 32 + 3 * 64]  # 0, 3 and 32 points at a length of 32
+    network.eval()
+    for parameter in network.encoder_norms.parameters():
+        torch.nn.init.uniform_(parameter)
+    assert torch.allclose(network.encode(patches, counts), network.encode(patches), atol=1e-6)

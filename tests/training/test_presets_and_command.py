@@ -57,13 +57,13 @@ def test_settings_can_be_changed_one_by_one() -> None:
             "loss.eta=0.5",
             "network.encoder=[4, 5]",
             "data.noise_levels=[0.01, 0.02]",
-            "own_from=[0.5]",
+            "own_from=[5]",
             "learning_rate=1",
         ],
     )
     assert (settings.steps, settings.loss.eta, settings.network.encoder) == (7, 0.5, (4, 5))
     assert settings.data.noise_levels == (0.01, 0.02)
-    assert settings.own_from == (0.5,)
+    assert settings.own_from == (5,)
     assert settings.learning_rate == 1.0
     assert settings.data.clouds == load_preset("smoke").data.clouds
 
@@ -81,11 +81,12 @@ WRONG = {
     "steps=[7]": "steps",
     "data=7": "data",
     'optimizer="lion"': "adamw",
-    'schedule="cosine"': "one-cycle",
+    'schedule="cosine"': "warmup-stable-decay",
+    "decay=0": "decay must be above 0",
+    "own_from=[0.5]": "own_from",
     'precision="float64"': "bfloat16",
     'loss.loss="chamfer"': "bilateral",
     'data.noise_levels=["much"]': "noise_levels",
-    "data.noise_levels=[]": "noise_levels",
     "own_from=0.5": "own_from",
     'loss.loss="l2"': "need each other",
     "network.adaptive=false": "need each other",
@@ -147,6 +148,14 @@ def test_a_run_that_goes_on_takes_no_other_settings(
     assert error.startswith("error: --resume takes its settings from the checkpoint")
     assert error.count("\n") == 1
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["step"] == 1
+
+
+def test_a_run_is_made_longer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert train(tmp_path / "run") == 0
+    assert command.main(["--out", str(tmp_path / "run"), "--resume", "--steps", "16"]) == 0
+    assert "16 steps" in capsys.readouterr().out
+    assert train(tmp_path / "new", "--steps", 16) == 2
+    assert "--set steps=N" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -25,6 +25,11 @@ def weights(run: Run) -> dict[str, torch.Tensor]:
     return {f"{name}.{key}": value.clone() for name, state in states.items() for key, value in state.items()}
 
 
+def saved(folder: Path, name: str = "checkpoint.pt") -> dict[str, Any]:
+    state: dict[str, Any] = torch.load(folder / name, weights_only=True)
+    return state
+
+
 def assert_same(a: Run, b: Run) -> None:
     first, second = weights(a), weights(b)
     assert first.keys() == second.keys()
@@ -45,7 +50,7 @@ def moving(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def straight(tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]) -> Run:
-    run = Run(tmp_path / "straight", tiny, resume=False)
+    run = Run(tmp_path / "straight", tiny)
     run.train(clouds)
     return run
 
@@ -54,16 +59,16 @@ def straight(tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]
 def test_a_run_that_was_stopped_goes_on_exactly(
     until: int, straight: Run, tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]
 ) -> None:
-    first = Run(tmp_path / "stopped", tiny, resume=False)
+    first = Run(tmp_path / "stopped", tiny)
     first.train(clouds, until)
     assert first.step == until
-    second = Run(tmp_path / "stopped", tiny, resume=True)
+    second = Run(tmp_path / "stopped", tiny, saved(tmp_path / "stopped"))
     assert second.step == until
     second.train(clouds)
     assert_same(straight, second)
 
 
-@pytest.mark.parametrize(("killed_at", "goes_on_from"), [(5, 4), (7, 4), (10, 8)])
+@pytest.mark.parametrize(("killed_at", "goes_on_from"), [(5, 4), (7, 4), (10, 9)])
 def test_a_run_that_was_killed_goes_on_from_its_checkpoint_exactly(
     killed_at: int,
     goes_on_from: int,
@@ -84,8 +89,8 @@ def test_a_run_that_was_killed_goes_on_from_its_checkpoint_exactly(
 
         patch.setattr(train_module, "batches_ahead", killed)
         with pytest.raises(KeyboardInterrupt):
-            Run(tmp_path / "killed", tiny, resume=False).train(clouds)
-    second = Run(tmp_path / "killed", tiny, resume=True)
+            Run(tmp_path / "killed", tiny).train(clouds)
+    second = Run(tmp_path / "killed", tiny, saved(tmp_path / "killed"))
     assert second.step == goes_on_from
     second.train(clouds)
     assert_same(straight, second)
@@ -132,7 +137,7 @@ def test_a_kill_while_saving_leaves_the_checkpoint_before(
     with pytest.raises(KeyboardInterrupt):
         straight.save()
     assert path.read_bytes() == before
-    assert Run(straight.folder, straight.settings, resume=True).step == 12
+    assert Run(straight.folder, straight.settings, saved(straight.folder)).step == 12
 
 
 def test_a_run_writes_its_curve_and_its_settings(straight: Run) -> None:
@@ -146,12 +151,12 @@ def test_a_run_writes_its_curve_and_its_settings(straight: Run) -> None:
     described = json.loads((straight.folder / "settings.json").read_text())
     assert TrainingSettings.from_dict(described) == straight.settings
     files = sorted(path.name for path in straight.folder.iterdir())
-    assert files == ["checkpoint.pt", "log.csv", "own-6.npz", "settings.json"]
+    assert files == ["checkpoint.pt", "log.csv", "own-6.npz", "settings.json", "stable.pt"]
 
 
 def test_validation_is_in_the_curve(tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]) -> None:
     settings = dataclasses.replace(tiny, steps=2, validate_every=2, validation_clouds=1)
-    run = Run(tmp_path, settings, resume=False)
+    run = Run(tmp_path, settings)
     run.train(clouds)
     (row,) = run.history
     assert list(row)[-2:] == ["validation_loss", "validation_distance"]
@@ -174,7 +179,7 @@ def test_validation_s_loss_is_that_of_the_run_s_progress(
         return real(*arguments, progress=progress)
 
     monkeypatch.setattr(train_module, "filtering_loss", loss)
-    Run(tmp_path, settings, resume=False).train(list(training_clouds(settings.data)))
+    Run(tmp_path, settings).train(list(training_clouds(settings.data)))
     assert seen == [0.5, 1.0]
 
 
@@ -201,9 +206,9 @@ def test_training_lowers_the_loss(
         weight_decay=0.0,
         validate_every=10**6,
         checkpoint_every=10**6,
-        own_from=(2.0,),  # never
+        own_from=(),
     )
-    run = Run(tmp_path, settings, resume=False)
+    run = Run(tmp_path, settings)
     batch = cut_batch(clouds, dataclasses.replace(settings.data, batch=128), 10**6)
 
     def loss() -> float:
@@ -219,7 +224,7 @@ def test_training_lowers_the_loss(
 @pytest.mark.parametrize("optimizer", ["adamw", "sgd"])
 def test_weight_decay_reaches_the_optimizer(optimizer: str, tmp_path: Path, tiny: TrainingSettings) -> None:
     settings = dataclasses.replace(tiny, optimizer=optimizer, weight_decay=0.125)
-    run = Run(tmp_path, settings, resume=False)
+    run = Run(tmp_path, settings)
     assert [group["weight_decay"] for group in run.optimizer.param_groups] == [0.125]
 
 
@@ -234,7 +239,7 @@ def test_gradients_are_clipped_where_there_is_a_limit(
 ) -> None:
     seen: list[float] = []
     monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", lambda _, largest: seen.append(largest))
-    Run(tmp_path, dataclasses.replace(tiny, gradient_clip=limit), resume=False).train(clouds, 2)
+    Run(tmp_path, dataclasses.replace(tiny, gradient_clip=limit)).train(clouds, 2)
     assert seen == calls
 
 
@@ -292,7 +297,7 @@ def test_a_run_trains_on_its_own_clouds_as_later_ones(
 
     monkeypatch.setattr(train_module, "batches_ahead", watched)
     settings = dataclasses.replace(tiny, data=dataclasses.replace(tiny.data, own_share=1.0))
-    Run(tmp_path, settings, resume=False).train(clouds)
+    Run(tmp_path, settings).train(clouds)
     assert later == [False] * 6 + [True] * 6
 
 
@@ -301,7 +306,7 @@ def test_a_new_run_takes_no_own_clouds_of_another(
 ) -> None:
     """A run that was killed before its first checkpoint leaves its folder to the next one."""
     np.savez(tmp_path / "own-6.npz", **{"0": np.random.default_rng(0).normal(size=(300, 3))})
-    run = Run(tmp_path, tiny, resume=False)
+    run = Run(tmp_path, tiny)
     run.train(clouds)
     assert_same(straight, run)
 
@@ -320,7 +325,7 @@ def test_weights_may_be_taken_over(tmp_path: Path, straight: Run, tiny: Training
     assert (before["steps"], before["settings"]["seed"]) == (straight.step, tiny.seed)
     third = start(tmp_path / "third", tiny, init=checkpoint(run), until=0)
     assert [record["settings"]["seed"] for record in third.before] == [tiny.seed, 5]
-    assert Run(third.folder, tiny, resume=True).before == third.before
+    assert Run(third.folder, tiny, saved(third.folder)).before == third.before
 
 
 def test_weights_of_another_network_are_refused(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
@@ -336,12 +341,46 @@ def test_a_run_that_goes_on_takes_no_other_weights(tmp_path: Path, straight: Run
 
 
 def test_the_seed_decides_the_weights(tmp_path: Path, tiny: TrainingSettings) -> None:
-    runs = [
-        Run(tmp_path / str(k), dataclasses.replace(tiny, seed=seed), resume=False) for k, seed in enumerate((0, 0, 1))
-    ]
+    runs = [Run(tmp_path / str(k), dataclasses.replace(tiny, seed=seed)) for k, seed in enumerate((0, 0, 1))]
     first = [next(iter(run.network.state_dict().values())) for run in runs]
     assert torch.equal(first[0], first[1])
     assert not torch.equal(first[0], first[2])
+
+
+def test_the_learning_rate_warms_up_stays_and_falls_to_nothing(
+    tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]
+) -> None:
+    run = Run(tmp_path, dataclasses.replace(tiny, steps=20, own_from=(), learning_rate=1e-2))
+    rates = [run.scheduler.get_last_lr()[0]]
+    for step in range(1, 21):
+        run.train(clouds, step)
+        rates.append(run.scheduler.get_last_lr()[0])
+    assert rates[:3] == pytest.approx([1e-2 / 3, 2e-2 / 3, 1e-2])
+    assert rates[3:16] == [1e-2] * 13
+    assert rates[15:] == pytest.approx([1e-2 * left / 5 for left in range(5, -1, -1)])
+
+
+@pytest.mark.parametrize("stopped_at", [5, 12])  # before the learning rate falls; at the end, after it fell
+def test_a_run_made_longer_is_one_that_was_longer_from_the_start(
+    stopped_at: int, tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]
+) -> None:
+    longer = dataclasses.replace(tiny, steps=20)
+    warm = dataclasses.replace(tiny, steps=12)
+    straight = Run(tmp_path / "straight", longer)
+    straight.train(clouds)
+    start(tmp_path / "run", warm, until=stopped_at)
+    again = start(tmp_path / "run", warm, resume=True, steps=20)
+    assert again.settings == longer
+    assert_same(straight, again)
+
+
+def test_a_run_cannot_get_another_length_once_the_rate_has_fallen(tmp_path: Path, tiny: TrainingSettings) -> None:
+    start(tmp_path, tiny)
+    (tmp_path / "stable.pt").unlink()
+    with pytest.raises(ValueError, match="the checkpoint of step 12 is too late"):
+        start(tmp_path, tiny, resume=True, steps=20)
+    with pytest.raises(ValueError, match="a run of 8 steps lowers its learning rate from step 6 on"):
+        start(tmp_path, tiny, resume=True, steps=8)
 
 
 def test_the_paper_s_schedule_ends_where_the_paper_says(
@@ -350,7 +389,7 @@ def test_the_paper_s_schedule_ends_where_the_paper_says(
     settings = dataclasses.replace(
         tiny, optimizer="sgd", schedule="exponential", learning_rate=1e-4, final_learning_rate=1e-8
     )
-    run = Run(tmp_path, settings, resume=False)
+    run = Run(tmp_path, settings)
     assert run.scheduler.get_last_lr()[0] == pytest.approx(1e-4)
     run.train(clouds)
     assert run.scheduler.get_last_lr()[0] == pytest.approx(1e-8, rel=1e-6)
@@ -372,7 +411,7 @@ def test_a_network_is_a_plain_callable(straight: Run) -> None:
 
 
 def test_the_paper_s_network_is_one_too(tmp_path: Path, tiny_paper: TrainingSettings) -> None:
-    network = Run(tmp_path, tiny_paper, resume=False)._trained()
+    network = Run(tmp_path, tiny_paper)._trained()
     assert network.settings == NetworkSettings((8, 16), (8,), adaptive=False)
     patches = np.random.default_rng(0).uniform(-1, 1, (4, 9, 3)).astype(np.float32)
     none = np.zeros((4, 3), np.float32)
