@@ -69,9 +69,9 @@ class DataSettings:
     """Distance of the farthest query from the centre, in units of the radius."""
     own_share: float = 0.35
     """Share of the patches that come from clouds which the network itself has filtered, once the run has made them."""
-    own_every: int = 3
-    """A third of the clouds are filtered."""
-    own_points: int = 10_000
+    own_every: int = 5
+    """A fifth of the clouds are filtered."""
+    own_points: int = 8_000
     """Most points of such a cloud: a piece of a whole one, since filtering costs more than anything else here."""
     patch_points: int = 192
     """Points of a noisy patch."""

@@ -25,13 +25,13 @@ UNCALIBRATED = Calibration(
     error_factor=1.0,
 )
 """How the filter uses a network of which nothing has been measured yet."""
-MOST_PASSES = 2  # that such a cloud has been through
+MOST_PASSES = 3  # that such a cloud has been through
 
 
 def own_clouds(
     file: Path, clouds: Sequence[TrainingCloud], network: Pointfilter, settings: DataSettings
 ) -> list[TrainingCloud]:
-    """A piece of every settings.own_every-th cloud after one or two passes of the network.
+    """A piece of every settings.own_every-th cloud after one to MOST_PASSES passes of the network.
 
     The pieces are kept in `file` and come from there when it exists, so that a resumed run sees the same.
     """

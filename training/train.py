@@ -49,7 +49,7 @@ class TrainingSettings:
     data: DataSettings = field(default_factory=DataSettings)
     loss: LossSettings = field(default_factory=LossSettings)
     steps: int = 200_000
-    own_from: tuple[int, ...] = (12_000, 30_000, 75_000, 180_000)
+    own_from: tuple[int, ...] = (12_000, 24_000, 36_000, 60_000, 100_000, 150_000)
     """Steps after which the network filters training clouds anew: later passes see its own outputs."""
     optimizer: str = "adamw"
     """adamw (default) or sgd (the paper's, §3.4)."""
