@@ -10,9 +10,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pointfilter.adaptive.balls import choose_balls
 from pointfilter.adaptive.calibration import Calibration
@@ -206,22 +208,23 @@ def _one_pass(
     check: Callable[[], None],
     clock: _Clock,
 ) -> None:
-    """Eq. 8 once for every point that is moving.
-
-    A point's answer depends on one patch alone, its own or that of a point close by.
-    """
+    """Eq. 8 once for every point that is moving. A point takes the mean of what the patches that reach it answer."""
     key = sampling_key(seed, iteration)
-    before, after = state.points, state.points.copy()
+    before = state.points
     with clock.measure("index"):
         grids = Grids(before)
         rows = np.flatnonzero(state.moving)
-        owners = rows
+        owners, reach = rows, 0.0
         if calibration is not None and calibration.query_reach > 0:
+            reach = calibration.query_reach
             keys = mixed(state.keys ^ np.uint64(key))
-            owners = patch_centres(grids, rows, state.radii, keys, calibration.query_reach, threads, check)
-        rows = rows[np.argsort(owners, kind="stable")]  # patch by patch
-        centres, sizes = np.unique(owners, return_counts=True)
+            owners = patch_centres(grids, rows, state.radii, keys, reach, threads, check)
+        centres = np.unique(owners)
+        asked_rows, sizes = reached(before, rows, centres, state.radii, reach, threads)
         starts = np.cumsum(sizes) - sizes
+        nearest = np.full(len(before), -1)
+        nearest[rows] = owners
+    means = _Means(state.radii)
     done = 0
     for chosen, index in grids.by_radius(centres, state.radii[centres]):
 
@@ -230,33 +233,70 @@ def _one_pass(
             with clock.measure("patches"):
                 patches = index.patches(centres[part], state.radii[centres[part]], patch_points, key)
                 patch, asked = numbers_of_ranges(starts[part], sizes[part])
-                asked = rows[asked]
+                asked = asked_rows[asked]
                 frames, radii = patches.frames[patch], patches.radii[patch][:, None]
-                queries = np.einsum("mij,mj->mi", frames, before[asked] - before[centres[part][patch]]) / radii
+                centre = centres[part][patch]
+                queries = np.einsum("mij,mj->mi", frames, before[asked] - before[centre]) / radii
             with clock.measure("infer"):
                 said = answers(
                     network, patches.points, patches.counts, iteration > 0, queries.astype(np.float32), patch, check
                 )
             # r R⁻¹ f(.): R is a rotation, so its inverse is its transpose; the rows of `frames` are the axes.
             steps = np.einsum("mi,mij->mj", said.displacements.astype(np.float64), frames) * radii
-            better = np.ones(len(asked), dtype=bool)
-            if calibration is not None and said.log_errors is not None:
-                log_moved, log_still = said.log_errors.astype(np.float64).T
-                better = log_still - log_moved > calibration.margin
-                errors = np.exp(np.where(better, log_moved, log_still)) * radii[:, 0]
-                state.errors[asked] = np.where(patches.counts[patch] < MIN_NEIGHBOURS, np.nan, errors)
-                state.moving[asked] = better
+            log_errors = None if said.log_errors is None else said.log_errors.astype(np.float64) + np.log(radii)
+            told = patches.counts[patch] >= MIN_NEIGHBOURS
+            means.add(asked[told], steps[told], None if log_errors is None else log_errors[told])
             if said.normals is not None:
-                normals = np.einsum("mi,mij->mj", said.normals.astype(np.float64), frames)
-                state.normals[asked] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-            after[asked[better]] += steps[better]
+                own = centre == nearest[asked]
+                normals = np.einsum("mi,mij->mj", said.normals[own].astype(np.float64), frames[own])
+                state.normals[asked[own]] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
             return len(asked)
 
         size = BATCHES_PER_TASK * patches_per_batch(patch_points)
         for answered in over_ranges(evaluate, len(chosen), size, threads, check):
             done += answered
-            report(done)
+            report(done * len(rows) // len(asked_rows))
+    steps, log_errors = means.of(rows)
+    better = np.ones(len(rows), dtype=bool)
+    if calibration is not None and log_errors is not None:
+        log_moved, log_still = log_errors.T
+        better = log_still - log_moved > calibration.margin  # not where nothing was told: NaN
+        state.errors[rows] = np.exp(np.where(better, log_moved, log_still))
+        state.moving[rows] = better
+    after = before.copy()
+    after[rows[better]] += np.nan_to_num(steps[better])
     state.points = after
+
+
+class _Means:
+    """Means of the answers for each of n points: of steps, and of logarithms of errors where there are any.
+
+    Sums are whole numbers of 2⁻⁴⁰ of the point's radius, which float64 adds exactly: their order does not matter.
+    """
+
+    def __init__(self, radii: Float64) -> None:
+        self._units = np.where(np.isfinite(radii), radii, 1.0) * 2.0**-40
+        self._sums = np.zeros((len(radii), 5))
+        self._counts = np.zeros(len(radii), dtype=np.int64)
+        self._log_errors = False
+        self._lock = threading.Lock()
+
+    def add(self, rows: Int64, steps: Float64, log_errors: Float64 | None) -> None:
+        """Takes (m, 3) steps and (m, 2) logarithms of errors, in the unit of the radii, for the points `rows` (m,)."""
+        values = np.zeros((len(rows), 5))
+        values[:, :3] = np.round(steps / self._units[rows, None])
+        if log_errors is not None:
+            values[:, 3:] = np.round(log_errors * 2.0**40)
+        with self._lock:
+            np.add.at(self._sums, rows, values)
+            np.add.at(self._counts, rows, 1)
+            self._log_errors |= log_errors is not None
+
+    def of(self, rows: Int64) -> tuple[Float64, Float64 | None]:
+        """The means (m, 3) and (m, 2); NaN for a point without answers."""
+        with np.errstate(invalid="ignore"):
+            means = self._sums[rows] / self._counts[rows, None]
+        return means[:, :3] * self._units[rows, None], means[:, 3:] * 2.0**-40 if self._log_errors else None
 
 
 def patch_centres(
@@ -268,7 +308,7 @@ def patch_centres(
     threads: int,
     check: Callable[[], None],
 ) -> Int64:
-    """For the points `rows` (q,): the row of the point whose patch answers for it, itself or one close by.
+    """For the points `rows` (q,): the row of a point whose patch answers for it, itself or one close by.
 
     It is the point with the smallest key in a ball of `reach` times the point's own radius; where that lies beyond
     `reach` of the centre's radius, the point is its own centre.
@@ -276,6 +316,23 @@ def patch_centres(
     owners = grids.smallest_key(rows, reach * radii[rows], keys, threads, check)
     distances = np.linalg.norm(grids.points[rows] - grids.points[owners], axis=1)
     return np.where(distances <= reach * radii[owners], owners, rows)
+
+
+def reached(
+    points: Float64, rows: Int64, centres: Int64, radii: Float64, reach: float, threads: int
+) -> tuple[Int64, Int64]:
+    """Which of the points `rows` (q,) lie within `reach` of the radius of each of the points `centres` (c,).
+
+    Returns their rows, centre after centre, and how many each centre has: (c,).
+    """
+    tree = cKDTree(points[rows])
+    far = reach * radii[centres]
+    lists = tree.query_ball_point(points[centres], far * (1 + 1e-9), workers=threads)  # which checks boxes of points
+    sizes = np.fromiter(map(len, lists), np.int64, len(lists))
+    found = rows[np.fromiter(chain.from_iterable(lists), np.int64, int(sizes.sum()))]
+    centre = np.repeat(np.arange(len(centres)), sizes)
+    near = np.linalg.norm(points[found] - points[centres[centre]], axis=1) <= far[centre]
+    return found[near], np.bincount(centre[near], minlength=len(centres))
 
 
 def resolve_radius(points: Float64, radius: float | None, fraction: float = DEFAULT_RADIUS) -> float:
