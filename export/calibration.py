@@ -22,9 +22,9 @@ from training.shapes import Mesh, random_shape
 Float64 = NDArray[np.float64]
 
 FAMILY = 2  # of shapes; training has family 0, validation family 1
-CLOUDS = 6
+CLOUDS = 8
 POINTS = (4_000, 12_000)
-LEVELS = (0.0025, 0.006, 0.015)  # of the noise, in turn; fractions of the diagonal
+LEVELS = (0.0025, 0.006, 0.012, 0.025)  # of the noise, in turn; fractions of the diagonal
 MEASURED_POINTS = 1_500  # of a cloud, whose distances are taken
 PREFERENCES = (-0.1, 0.0, 0.1, 0.2)
 MARGINS = (0.0, 0.1, 0.2)

@@ -173,7 +173,7 @@ def filter_points(
 
     return Filtered(
         points=filtered,
-        errors=spread(state.errors * (calibration.error_factor if calibration is not None else 1.0)),
+        errors=spread(state.errors() * (calibration.error_factor if calibration is not None else 1.0)),
         radii=spread(state.radii),
         moved=np.any(filtered != points, axis=1),
         normals=spread(state.normals),
@@ -184,16 +184,29 @@ def filter_points(
 
 
 class _State:
-    """The distinct places of a cloud on their way through the passes. points (p, 3), keys (p,), radii, errors (p,),
+    """The distinct places of a cloud on their way through the passes. points (p, 3), keys (p,), radii (p,),
     normals (p, 3), and which of them the next pass looks at."""
 
     def __init__(self, points: Float64, keys: UInt64) -> None:
         self.points = points
         self.keys = keys
         self.radii = np.full(len(points), np.nan)
-        self.errors = np.full(len(points), np.nan)
+        self._log_errors = np.zeros(len(points))
+        self._passes = np.zeros(len(points), dtype=np.int64)
         self.normals = np.full((len(points), 3), np.nan)
         self.moving = np.ones(len(points), dtype=bool)
+
+    def expect(self, rows: Int64, log_errors: Float64) -> None:
+        """Takes what a pass expects of the points `rows`."""
+        self._log_errors[rows] += log_errors
+        self._passes[rows] += 1
+
+    def errors(self) -> Float64:
+        """Expected distances to the surface: the geometric mean over the passes. The first one knows the noise best,
+        the last one the surface; what the last one alone expects is too little under heavy noise, which it sees no
+        longer."""
+        with np.errstate(invalid="ignore"):
+            return np.exp(self._log_errors / self._passes)
 
 
 def _one_pass(
@@ -261,7 +274,7 @@ def _one_pass(
     if calibration is not None and log_errors is not None:
         log_moved, log_still = log_errors.T
         better = log_still - log_moved > calibration.margin  # not where nothing was told: NaN
-        state.errors[rows] = np.exp(np.where(better, log_moved, log_still))
+        state.expect(rows, np.where(better, log_moved, log_still))
         state.moving[rows] = better
     after = before.copy()
     after[rows[better]] += np.nan_to_num(steps[better])

@@ -211,6 +211,15 @@ def test_points_whose_balls_do_not_help_stay_while_others_move() -> None:
     assert result.moved[1_000:].all()
 
 
+def test_the_expected_error_is_the_geometric_mean_over_the_passes() -> None:
+    network = saying(dict.fromkeys(CALIBRATION.balls, -1.0), later=-0.5)
+    result = filter_points(
+        plane(500), network, calibration=CALIBRATION, patch_points=50, radius=0.2, iterations=3, origin=np.zeros(3)
+    )
+    expected = CALIBRATION.error_factor * 0.2 * np.exp((-2.0 - 1.5 - 1.5) / 3)
+    np.testing.assert_allclose(result.errors, expected, rtol=1e-6)
+
+
 def test_each_point_of_a_patch_moves_or_stays_by_its_own_errors() -> None:
     def near_the_centre(patches: np.ndarray, context: np.ndarray, queries: np.ndarray, owners: np.ndarray) -> Answers:
         gain = np.where(np.linalg.norm(queries, axis=1) < 0.2, -1.0, 1.0).astype(np.float32)
