@@ -48,7 +48,7 @@ class TrainingSettings:
     network: NetworkSettings = field(default_factory=NetworkSettings)
     data: DataSettings = field(default_factory=DataSettings)
     loss: LossSettings = field(default_factory=LossSettings)
-    steps: int = 200_000
+    steps: int = 43_200
     own_from: tuple[int, ...] = (12_000, 24_000, 36_000, 60_000, 100_000, 150_000)
     """Steps after which the network filters training clouds anew: later passes see its own outputs."""
     optimizer: str = "adamw"
