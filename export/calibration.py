@@ -27,6 +27,7 @@ POINTS = (4_000, 12_000)
 LEVELS = (0.0025, 0.006, 0.012, 0.025)  # of the noise, in turn; fractions of the diagonal
 MEASURED_POINTS = 1_500  # of a cloud, whose distances are taken
 PREFERENCES = (-0.1, 0.0, 0.1, 0.2)
+STILL_WEIGHTS = (0.5, 0.75, 1.0)
 MARGINS = (0.0, 0.1, 0.2)
 MOST_LOSS = 0.01  # of the error on noisy clouds, that a larger margin may cost for leaving clean ones as they are
 
@@ -55,6 +56,7 @@ def calibrate(serialised: bytes, patch_points: int) -> Calibration:
         return float(np.mean(np.log(left) - np.log([cloud.level for cloud in noisy])))
 
     chosen = min((dataclasses.replace(UNCALIBRATED, preference=preference) for preference in PREFERENCES), key=cost)
+    chosen = min((dataclasses.replace(chosen, still_weight=weight) for weight in STILL_WEIGHTS), key=cost)
     least = cost(chosen)
     for margin in MARGINS:
         larger = dataclasses.replace(chosen, margin=margin)

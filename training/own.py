@@ -19,6 +19,7 @@ from training.network import Pointfilter
 UNCALIBRATED = Calibration(
     balls=(24, 48, 96, 192, 384, 768, 1536, 3072),
     preference=0.05,
+    still_weight=1.0,
     margin=0.0,
     passes=4,
     query_reach=0.45,

@@ -35,11 +35,11 @@ def choose_balls(
     threads: int,
     check: Callable[[], None],
 ) -> tuple[Float64, Float64]:
-    """The radius (n,) of each point's ball, and the least logarithm (n,) of the expected error there as a share of the
-    error without a filter: above 0 where no ball helps.
+    """The radius (n,) of each point's ball, and the logarithm (n,) of the expected error there as a share of the error
+    without a filter: above 0 where the ball does not help.
 
-    Balls are compared by that share: the error without a filter is the same for all of them, so that what a ball knows
-    wrongly cancels out; one that holds nothing but noise underestimates both errors.
+    Balls are compared by that share, as far as calibration.still_weight says: the error without a filter is the same for
+    all of them, so that what a ball knows wrongly cancels out; one that holds nothing but noise underestimates both.
 
     points: (n, 3) distinct, more of them than the smallest ball holds. keys, reach: of neighbourhood_keys. One point in
     a neighbourhood is a probe: all balls of the calibration are evaluated for it. The expected errors are averaged over
@@ -48,7 +48,8 @@ def choose_balls(
     grids = Grids(points)
     probes = np.unique(grids.smallest_key(np.arange(len(points)), PROBE_REACH * reach, keys, threads, check))
     sizes = np.array(calibration.balls)
-    radii, gains = np.empty((len(probes), len(sizes))), np.full((len(probes), len(sizes)), np.inf)
+    radii = np.empty((len(probes), len(sizes)))
+    gains, still = np.full((2, len(probes), len(sizes)), np.inf)
 
     for rows, index in grids.by_radius(probes, reach[probes]):
 
@@ -66,15 +67,17 @@ def choose_balls(
             if said.log_errors is None:
                 raise InvalidModelError("the network has a calibration and answers without expected errors")
             gains[chosen[there], column] = said.log_errors[:, 0] - said.log_errors[:, 1]
+            still[chosen[there], column] = said.log_errors[:, 1] + np.log(found[there, column])
 
         for _ in over_ranges(evaluate, len(rows), PROBES_PER_TASK, threads, check):
             pass
 
     tree = cKDTree(points[probes])
     _, near = tree.query(points[probes], k=np.arange(1, min(SMOOTHED, len(probes)) + 1), workers=threads)
-    gains = gains[near].mean(axis=1)
+    gains, still = gains[near].mean(axis=1), still[near].mean(axis=1)
+    wanted = gains if calibration.still_weight == 1 else gains + (1 - calibration.still_weight) * still
     doublings = np.log2(np.where(np.isfinite(radii), radii, 1.0) / np.maximum(reach[probes], SMALLEST_RADIUS)[:, None])
-    wanted = gains + calibration.preference * doublings
+    wanted = wanted + calibration.preference * doublings
     best = len(sizes) - 1 - np.argmin(wanted[:, ::-1], axis=1)  # the larger at a tie
     rows = np.arange(len(probes))
     log_radii = np.log(radii[rows, best])

@@ -16,6 +16,9 @@ class Calibration:
     preference: float
     """Added to the logarithm of an expected error for each doubling of the radius: above 0 for smaller balls, since
     later passes lower the error of a small ball further than that of a large one."""
+    still_weight: float
+    """Balls are compared by the logarithm of the expected error, less so much of that of the error without a filter: 1
+    compares shares, in which what a ball knows wrongly cancels out, 0 the errors themselves."""
     margin: float
     """By how much the logarithm of the error must fall for a point to move."""
     passes: int
@@ -38,12 +41,16 @@ class Calibration:
             or balls[0] < 4
         ):
             raise ValueError(f"calibration: balls must be ascending numbers of points from 4 on, not {balls}")
-        numbers = {name: float(values[name]) for name in ("preference", "margin", "query_reach", "error_factor")}
+        numbers = {
+            name: float(values[name])
+            for name in ("preference", "still_weight", "margin", "query_reach", "error_factor")
+        }
         if not (
             all(map(math.isfinite, numbers.values()))
             and 0 <= numbers["query_reach"] <= 1
             and numbers["error_factor"] > 0
             and abs(numbers["preference"]) <= 10
+            and 0 <= numbers["still_weight"] <= 1
         ):
             raise ValueError(f"calibration: out of range: {numbers}")
         passes = values["passes"]

@@ -33,7 +33,13 @@ class FakeEngine:
         sha256="0" * 64,
         patch_points=64,
         calibration=Calibration(
-            balls=(24, 96, 384), preference=0.0, margin=0.0, passes=2, query_reach=0.4, error_factor=1.0
+            balls=(24, 96, 384),
+            preference=0.0,
+            still_weight=1.0,
+            margin=0.0,
+            passes=2,
+            query_reach=0.4,
+            error_factor=1.0,
         ),
     )
     provider = "none"

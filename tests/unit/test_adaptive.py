@@ -20,7 +20,7 @@ from pointfilter.patches import mixed, sampling_key
 from tests.clouds import adaptive_pooled, pooled_displacements, rotation
 
 CALIBRATION = Calibration(
-    balls=(24, 48, 96, 192), preference=0.0, margin=0.0, passes=4, query_reach=0.4, error_factor=2.0
+    balls=(24, 48, 96, 192), preference=0.0, still_weight=1.0, margin=0.0, passes=4, query_reach=0.4, error_factor=2.0
 )
 
 
@@ -119,6 +119,14 @@ def test_the_larger_ball_at_a_tie_and_the_preferred_one() -> None:
     largest, _ = balls(points, saying(same))
     smallest, _ = balls(points, saying(same), preference=0.1)
     assert np.median(largest) / np.median(smallest) == pytest.approx(np.sqrt(192 / 24), rel=0.15)
+
+
+def test_shares_or_errors_are_compared() -> None:
+    """Each ball expects the same share, and an error in proportion to its radius."""
+    points, same = plane(2_000, noise=0.0), dict.fromkeys(CALIBRATION.balls, -1.0)
+    by_share, _ = balls(points, saying(same), still_weight=1.0)
+    by_error, _ = balls(points, saying(same), still_weight=0.0)
+    assert np.median(by_share) / np.median(by_error) == pytest.approx(np.sqrt(192 / 24), rel=0.15)
 
 
 def test_balls_larger_than_the_cloud_are_left_out() -> None:

@@ -16,7 +16,7 @@ from pointfilter.adaptive.calibration import Calibration
 from tests.clouds import adaptive_pooled, crease, filter_points, pooled, rotation
 
 CALIBRATION = Calibration(
-    balls=(8, 16, 32, 64), preference=0.0, margin=0.0, passes=3, query_reach=0.4, error_factor=1.0
+    balls=(8, 16, 32, 64), preference=0.0, still_weight=1.0, margin=0.0, passes=3, query_reach=0.4, error_factor=1.0
 )
 
 clouds = st.tuples(st.integers(0, 2**32), st.integers(30, 250), st.sampled_from(["ball", "sheet", "crease"]))

@@ -192,7 +192,9 @@ def test_passes_that_the_filter_does_not_make_leave_the_rows_alike(helping: int,
     """An adaptive network that expects to help in the first passes alone, and then says that it does not."""
     rng = np.random.default_rng(0)
     noisy = add_noise(crease(400, rng), FINE, rng)
-    calibration = Calibration(balls=(24,), preference=0.0, margin=0.0, passes=6, query_reach=0.0, error_factor=1.0)
+    calibration = Calibration(
+        balls=(24,), preference=0.0, still_weight=1.0, margin=0.0, passes=6, query_reach=0.0, error_factor=1.0
+    )
     asked: list[int] = []
 
     class Network:
