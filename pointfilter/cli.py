@@ -23,6 +23,7 @@ from typing import Any
 
 import pointfilter
 from pointfilter import errors
+from pointfilter.attributes import KEEP, NORMALS
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import DEVICES, Engine, available_cpus
 from pointfilter.evaluation import evaluate
@@ -101,6 +102,12 @@ def build_parser() -> argparse.ArgumentParser:
         action="store_true",
         help="the paper's mode: balls of 5%% of the diagonal, two passes, all points move",
     )
+    command.add_argument(
+        "--normals",
+        default=KEEP,
+        choices=NORMALS,
+        help="columns nx ny nz: keep them, write the network's, or leave them out (default: %(default)s)",
+    )
     command.add_argument("--seed", type=int, default=0, metavar="S", help="of the downsampling (default: %(default)s)")
     command.add_argument("--device", default="auto", help=f"auto, {', '.join(DEVICES)} (default: %(default)s)")
     command.add_argument("--threads", type=int, default=0, metavar="T", help="default: all that this process may use")
@@ -156,6 +163,7 @@ def _filter(options: argparse.Namespace) -> int:
                     strength=options.strength,
                     max_move=options.max_move,
                     paper=options.paper,
+                    normals=options.normals,
                     progress=progress,
                 )
             filtered.write(result, options.format, report.comment)

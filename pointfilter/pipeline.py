@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pointfilter.attributes import KEEP, check_normal_columns, check_normals, with_normals
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import ParameterError
@@ -99,6 +100,7 @@ def filter_cloud(
     strength: float = 1.0,
     max_move: float | None = None,
     paper: bool = False,
+    normals: str = KEEP,
     progress: Callable[[int, int], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> tuple[PointCloud, Report]:
@@ -106,8 +108,11 @@ def filter_cloud(
 
     iterations: most passes. radius: of all balls; by default the network chooses, point by point. strength: factor of
     each displacement, from 0 to 1. max_move: longest displacement of a point, in the unit of the file, applied after
-    strength. paper: the paper's mode, for bundles that have another one. See filter.filter_points for progress,
-    cancelled and what is raised.
+    strength. paper: the paper's mode, for bundles that have another one. normals: of attributes.NORMALS, what becomes
+    of the columns nx, ny and nz: "keep" leaves them, "recompute" writes the network's normals of the filtered points
+    (unit length, on the side of the old normal, else away from the centre of the bounding box; a row without an answer
+    keeps its old normal, or gets 0 0 0), "drop" leaves the columns out. See filter.filter_points for progress,
+    cancelled and what is raised; ParameterError is raised for normals that cannot be recomputed, too.
     """
     started = time.perf_counter()
     if not 0 <= strength <= 1:
@@ -117,6 +122,8 @@ def filter_cloud(
             f"max_move must be a length above 0 in the unit of the file, got {max_move:g}", actual=max_move
         )
     bundle = engine.bundle
+    check_normals(normals, bundle, paper)
+    check_normal_columns(cloud, normals)
     finite = cloud.finite
     points = cloud.xyz[finite]
     absolute = None
@@ -140,6 +147,7 @@ def filter_cloud(
     displacements = np.linalg.norm(filtered - points, axis=1)
     xyz = cloud.xyz.copy()
     xyz[finite] = filtered
+    clean, notes = with_normals(cloud.with_xyz(xyz), normals, finite, result, displacements)
     low, middle, high = _percentiles(result.radii)
     told = np.isfinite(result.errors)
     report = Report(
@@ -161,9 +169,9 @@ def filter_cloud(
         mean_displacement=float(displacements.mean()),
         largest_displacement=float(displacements.max()),
         seconds={**result.seconds, "total": time.perf_counter() - started},
-        warnings=_warnings(cloud, points, result),
+        warnings=(*_warnings(cloud, points, result), *notes),
     )
-    return cloud.with_xyz(xyz), report
+    return clean, report
 
 
 def limited(

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from fastapi import Depends, Query
 
+from pointfilter.attributes import check_normals
 from pointfilter.errors import ParameterError
 from pointfilter.models import AUTO
 from pointfilter.pipeline import Radius
@@ -52,10 +53,18 @@ async def _order(
     paper: Annotated[
         bool, Query(description="The paper's mode: balls of 5 % of the bounding box's diagonal, two passes")
     ] = False,
+    normals: Annotated[
+        Literal["keep", "recompute", "drop"],
+        Query(
+            description="Columns nx, ny and nz: keep them as they are, write the network's normals of the filtered "
+            "points, or leave the columns out"
+        ),
+    ] = "keep",
 ) -> Order:
     """Raises ParameterError, ModelError."""
     bundle = await asyncio.to_thread(house.engines.bundle, model or house.settings.model)
     exchange.model = bundle.name
+    check_normals(normals, bundle, paper)
     return Order(
         model=model or house.settings.model,
         iterations=None if iterations is None else _iterations(iterations, house.settings.max_iterations),
@@ -65,6 +74,7 @@ async def _order(
         strength=strength,
         max_move=max_move,
         paper=paper,
+        normals=normals,
     )
 
 

@@ -16,6 +16,7 @@ from typing import TypeVar
 
 from starlette.requests import Request
 
+from pointfilter.attributes import KEEP
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import FilteringCancelledError, InputError, LimitExceededError
@@ -43,6 +44,7 @@ class Order:
     strength: float = 1.0
     max_move: float | None = None
     paper: bool = False
+    normals: str = KEEP
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ def carry_out(
         strength=order.strength,
         max_move=order.max_move,
         paper=order.paper,
+        normals=order.normals,
         progress=lambda done, total: progress(done, total, points),
         cancelled=stopped,
     )

@@ -77,6 +77,14 @@ def test_strength_and_longest_move_reach_the_filter(noisy_file: Path, tmp_path: 
     assert largest("--max-move", full / 3) == pytest.approx(full / 3)
 
 
+def test_normals_reach_the_filter(noisy_file: Path, tmp_path: Path, capsys: Capture) -> None:
+    options = ("--quiet", "--model", models.BUNDLES / ADAPTIVE, "--normals")
+    for normals, found in (("keep", []), ("recompute", ["nx", "ny", "nz"]), ("drop", [])):
+        assert run("filter", noisy_file, tmp_path / "a.ply", *options, normals) == 0
+        assert list(PointCloud.read(tmp_path / "a.ply").column_types)[4:] == found
+    assert "adaptive model" in refused(capsys, 2, "filter", noisy_file, tmp_path / "b.ply", "--normals", "recompute")
+
+
 def test_the_paper_s_mode_of_an_adaptive_bundle(noisy_file: Path, tmp_path: Path, capsys: Capture) -> None:
     reports = []
     for options in ([], ["--paper"]):

@@ -1,0 +1,91 @@
+"""Columns that the filter writes beside x, y and z: normals of the filtered points, and figures on each point."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pointfilter.cloud import PointCloud
+from pointfilter.errors import ParameterError
+from pointfilter.filter import Filtered
+from pointfilter.models import DEFAULT_MODEL, ModelBundle
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+KEEP, RECOMPUTE, DROP = "keep", "recompute", "drop"
+NORMALS = (KEEP, RECOMPUTE, DROP)
+NORMAL_COLUMNS = ("nx", "ny", "nz")
+
+
+# --- normals ----------------------------------------------------------------------------------------------------------
+
+
+def check_normals(normals: str, bundle: ModelBundle, paper: bool) -> None:
+    """Raises ParameterError for a word that is none of NORMALS, and for RECOMPUTE without a network that answers with
+    normals."""
+    if normals not in NORMALS:
+        raise ParameterError(f"normals must be one of {', '.join(NORMALS)}, got {normals[:40]!r}", actual=normals[:40])
+    if normals == RECOMPUTE and (paper or bundle.calibration is None):
+        reason = "the paper's mode has none" if paper else f"model {bundle.name!r} has none"
+        raise ParameterError(
+            f"normals={RECOMPUTE} needs a network that answers with normals; {reason}",
+            actual=normals,
+            hint=f"leave out paper and use an adaptive model such as {DEFAULT_MODEL}, or normals={KEEP} or {DROP}",
+        )
+
+
+def check_normal_columns(cloud: PointCloud, normals: str) -> None:
+    """Raises ParameterError where RECOMPUTE cannot write to the cloud's columns nx, ny and nz."""
+    found = [name for name in NORMAL_COLUMNS if name in cloud.column_types]
+    if normals != RECOMPUTE or not found:
+        return
+    kinds = [cloud.column_types[name] for name in found]
+    if len(found) < len(NORMAL_COLUMNS) or not all(kind is not None and kind.kind == "f" for kind in kinds):
+        raise ParameterError(
+            f"normals={RECOMPUTE} needs all of nx, ny and nz as float or double, or none of them; the file has "
+            + ", ".join(
+                f"{name} ({'list' if kind is None else kind.name})" for name, kind in zip(found, kinds, strict=True)
+            ),
+            actual=", ".join(found),
+            hint=f"remove them with normals={DROP} first",
+        )
+
+
+def with_normals(
+    cloud: PointCloud, normals: str, finite: Bool, result: Filtered, displacements: Float64
+) -> tuple[PointCloud, list[str]]:
+    """The cloud with its normals as asked for, and what is worth knowing about them, a sentence each.
+
+    cloud: n points with the filtered coordinates; check_normal_columns has passed. finite: (n,) bool, the m rows that
+    were filtered. result: what the filter says of them. displacements: (m,) float64, the lengths of their moves.
+    """
+    found = [name for name in NORMAL_COLUMNS if name in cloud.column_types]
+    if normals == DROP:
+        return cloud.without_columns(found), []
+    if normals == KEEP:
+        if not (found and displacements.any()):
+            return cloud, []
+        return cloud, [
+            f"the file's normals ({', '.join(found)}) are those of the unfiltered points; normals={RECOMPUTE} writes "
+            f"new ones, normals={DROP} removes them"
+        ]
+    old = cloud.column_values(NORMAL_COLUMNS) if found else np.zeros((len(cloud), 3))
+    new = np.full((len(cloud), 3), np.nan)
+    new[finite] = signed(result.normals, old[finite], cloud.xyz[finite])
+    unknown = ~np.isfinite(new).all(axis=1)
+    new[unknown] = old[unknown]
+    notes = []
+    if unknown.any():
+        given = "keep their old normal" if found else "have the normal 0 0 0"
+        notes.append(f"{unknown.sum()} rows got no normal from the network, as where no ball helps, and {given}")
+    return cloud.with_columns(dict(zip(NORMAL_COLUMNS, new.T, strict=True))), notes
+
+
+def signed(normals: Float64, old: Float64, points: Float64) -> Float64:
+    """The normals (n, 3), each on the side of the old one (n, 3); where that is 0, not finite or perpendicular, away
+    from the centre of the bounding box of the points (n, 3)."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    outward = np.einsum("ij,ij->i", normals, points - (low + (high - low) / 2))
+    agreement = np.einsum("ij,ij->i", normals, np.nan_to_num(old, nan=0.0, posinf=0.0, neginf=0.0))
+    return np.where((np.where(agreement == 0, outward, agreement) < 0)[:, None], -normals, normals)
