@@ -23,7 +23,7 @@ from typing import Any
 
 import pointfilter
 from pointfilter import errors
-from pointfilter.attributes import KEEP, NORMALS
+from pointfilter.attributes import COLUMNS, KEEP, NORMALS, parse_columns
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import DEVICES, Engine, available_cpus
 from pointfilter.evaluation import evaluate
@@ -108,6 +108,12 @@ def build_parser() -> argparse.ArgumentParser:
         choices=NORMALS,
         help="columns nx ny nz: keep them, write the network's, or leave them out (default: %(default)s)",
     )
+    command.add_argument(
+        "--columns",
+        default="",
+        metavar="C",
+        help=f"columns to add, separated by commas, of {', '.join(COLUMNS)} (default: none)",
+    )
     command.add_argument("--seed", type=int, default=0, metavar="S", help="of the downsampling (default: %(default)s)")
     command.add_argument("--device", default="auto", help=f"auto, {', '.join(DEVICES)} (default: %(default)s)")
     command.add_argument("--threads", type=int, default=0, metavar="T", help="default: all that this process may use")
@@ -148,6 +154,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _filter(options: argparse.Namespace) -> int:
     radius = Radius.parse(options.radius) if options.radius is not None else None
+    columns = parse_columns(options.columns)
     engine = Engine(open_model(options.model, model_folders()), options.device, options.threads)
     to_stdout = options.output == "-"
     for source, target in _pairs(options.input, options.output):
@@ -164,6 +171,7 @@ def _filter(options: argparse.Namespace) -> int:
                     max_move=options.max_move,
                     paper=options.paper,
                     normals=options.normals,
+                    columns=columns,
                     progress=progress,
                 )
             filtered.write(result, options.format, report.comment)

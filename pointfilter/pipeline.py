@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pointfilter.attributes import KEEP, check_normal_columns, check_normals, with_normals
+from pointfilter.attributes import (
+    KEEP,
+    check_new_columns,
+    check_normal_columns,
+    check_normals,
+    checked_columns,
+    with_figures,
+    with_normals,
+)
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import ParameterError
@@ -101,6 +109,7 @@ def filter_cloud(
     max_move: float | None = None,
     paper: bool = False,
     normals: str = KEEP,
+    columns: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> tuple[PointCloud, Report]:
@@ -111,8 +120,11 @@ def filter_cloud(
     strength. paper: the paper's mode, for bundles that have another one. normals: of attributes.NORMALS, what becomes
     of the columns nx, ny and nz: "keep" leaves them, "recompute" writes the network's normals of the filtered points
     (unit length, on the side of the old normal, else away from the centre of the bounding box; a row without an answer
-    keeps its old normal, or gets 0 0 0), "drop" leaves the columns out. See filter.filter_points for progress,
-    cancelled and what is raised; ParameterError is raised for normals that cannot be recomputed, too.
+    keeps its old normal, or gets 0 0 0), "drop" leaves the columns out. columns: some of attributes.COLUMNS,
+    each of which adds a column (see attributes.with_figures): "displacement", "uncertainty", "outlier".
+
+    See filter.filter_points for progress, cancelled and what is raised; ParameterError is raised for normals that
+    cannot be recomputed and for columns that the cloud has already, too.
     """
     started = time.perf_counter()
     if not 0 <= strength <= 1:
@@ -124,6 +136,8 @@ def filter_cloud(
     bundle = engine.bundle
     check_normals(normals, bundle, paper)
     check_normal_columns(cloud, normals)
+    columns = checked_columns(columns)
+    check_new_columns(cloud, columns)
     finite = cloud.finite
     points = cloud.xyz[finite]
     absolute = None
@@ -147,7 +161,8 @@ def filter_cloud(
     displacements = np.linalg.norm(filtered - points, axis=1)
     xyz = cloud.xyz.copy()
     xyz[finite] = filtered
-    clean, notes = with_normals(cloud.with_xyz(xyz), normals, finite, result, displacements)
+    clean, on_normals = with_normals(cloud.with_xyz(xyz), normals, finite, result, displacements)
+    clean, on_columns = with_figures(clean, columns, finite, points, result, displacements)
     low, middle, high = _percentiles(result.radii)
     told = np.isfinite(result.errors)
     report = Report(
@@ -169,7 +184,7 @@ def filter_cloud(
         mean_displacement=float(displacements.mean()),
         largest_displacement=float(displacements.max()),
         seconds={**result.seconds, "total": time.perf_counter() - started},
-        warnings=(*_warnings(cloud, points, result), *notes),
+        warnings=(*_warnings(cloud, points, result), *on_normals, *on_columns),
     )
     return clean, report
 

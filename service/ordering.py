@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from fastapi import Depends, Query
 
-from pointfilter.attributes import check_normals
+from pointfilter.attributes import check_normals, parse_columns
 from pointfilter.errors import ParameterError
 from pointfilter.models import AUTO
 from pointfilter.pipeline import Radius
@@ -60,6 +60,14 @@ async def _order(
             "points, or leave the columns out"
         ),
     ] = "keep",
+    columns: Annotated[
+        str,
+        Query(
+            description="Columns to add, separated by commas: displacement (length of the move), uncertainty (expected "
+            "distance to the surface), outlier (1 or 0); scalar_ stands before each name in the file",
+            max_length=100,
+        ),
+    ] = "",
 ) -> Order:
     """Raises ParameterError, ModelError."""
     bundle = await asyncio.to_thread(house.engines.bundle, model or house.settings.model)
@@ -75,6 +83,7 @@ async def _order(
         max_move=max_move,
         paper=paper,
         normals=normals,
+        columns=parse_columns(columns),
     )
 
 

@@ -45,6 +45,7 @@ class Order:
     max_move: float | None = None
     paper: bool = False
     normals: str = KEEP
+    columns: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,7 @@ def carry_out(
         max_move=order.max_move,
         paper=order.paper,
         normals=order.normals,
+        columns=order.columns,
         progress=lambda done, total: progress(done, total, points),
         cancelled=stopped,
     )

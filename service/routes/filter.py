@@ -39,7 +39,7 @@ HEADERS = {
 }
 _ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "The filtered file: moved coordinates, the columns that were asked for, everything else as it came",
+        "description": "The filtered file: moved coordinates, columns that were asked for, everything else as it came",
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
         "headers": {name: {"description": text, "schema": {"type": "string"}} for name, text in HEADERS.items()},
     },

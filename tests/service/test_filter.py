@@ -63,6 +63,8 @@ def test_curls_default_content_type_is_a_raw_body(client: TestClient, ply: bytes
         ("paper=true", {"paper": True}),
         ("normals=keep", {"normals": "keep"}),
         ("normals=drop", {"normals": "drop"}),
+        ("columns=displacement,outlier", {"columns": ("displacement", "outlier")}),
+        ("columns=", {"columns": ()}),
         ("radius=20%25", {"radius": Radius(0.2, relative=True)}),
         ("radius=20%", {"radius": Radius(0.2, relative=True)}),
         ("radius=0.3", {"radius": Radius(0.3, relative=False)}),

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pointfilter import Engine, PointCloud, filter_cloud
-from pointfilter.attributes import signed
+from pointfilter import Engine, PointCloud, Radius, filter_cloud
+from pointfilter.attributes import parse_columns, signed
 from pointfilter.errors import ParameterError
 from tests.ply_files import ORDERS, Column, Table, write_ply
 
@@ -217,3 +217,84 @@ def test_the_side_of_a_normal() -> None:
     normals = np.array([[1.0, 0, 0], [-1, 0, 0], [-1, 0, 0], [np.nan] * 3])
     old = np.array([[np.nan, 0, 0], [0, 0, 0], [-0.1, 5, 0], [1, 0, 0]])
     np.testing.assert_array_equal(signed(normals, old, points)[:, 0], [-1, 1, -1, np.nan])
+
+
+# --- figures on each point ---
+
+FIGURES = ("scalar_displacement", "scalar_uncertainty", "scalar_outlier")
+COLUMNS = ("displacement", "uncertainty", "outlier")
+
+
+@pytest.mark.parametrize(
+    ("text", "columns"),
+    [("", ()), (" ", ()), ("outlier", COLUMNS[2:]), ("outlier, displacement,outlier", (COLUMNS[0], COLUMNS[2]))],
+)
+def test_columns_are_words_between_commas(text: str, columns: tuple[str, ...]) -> None:
+    assert parse_columns(text) == columns
+
+
+@pytest.mark.parametrize("text", ["colour", ",", "outlier,", "scalar_outlier", "Outlier"])
+def test_a_column_that_is_none_names_those_that_are(text: str) -> None:
+    with pytest.raises(ParameterError, match="displacement, uncertainty, outlier"):
+        parse_columns(text)
+
+
+@pytest.mark.parametrize("lists", [False, True], ids=["numbers", "lists"])
+@pytest.mark.parametrize("kind", ["float", "double"])
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_figures_on_each_point(
+    encoding: str, kind: str, lists: bool, default_engine: Engine, noisy_crease: np.ndarray, tmp_path: Path
+) -> None:
+    points = np.vstack([noisy_crease, np.zeros((40, 3)), np.full((2, 3), np.nan)])
+    cloud = PointCloud.read(scan(tmp_path, points, encoding, kind, lists))
+    filtered, report = filter_cloud(cloud, default_engine, columns=COLUMNS)
+    again = through(filtered, tmp_path)
+    assert list(again.column_types)[-3:] == list(FIGURES)
+    assert {again.column_types[name] for name in FIGURES} == {np.dtype(np.float32)}
+    displacement, uncertainty, outlier = again.column_values(FIGURES).T
+    moves = np.linalg.norm(filtered.xyz[:640] - cloud.xyz[:640], axis=1)
+    np.testing.assert_allclose(displacement, [*moves, 0, 0], rtol=1e-6)
+    assert np.isnan(uncertainty[600:]).all()
+    assert np.nanmean(uncertainty) == pytest.approx(report.expected_error, rel=1e-5)
+    np.testing.assert_array_equal(outlier[600:], 1)
+    assert set(outlier[:600]) <= {0, 1}
+    assert outlier[:600].mean() < 0.1
+    np.testing.assert_array_equal(filtered.xyz, filter_cloud(cloud, default_engine)[0].xyz)
+
+
+def test_a_point_that_is_far_from_everything_is_an_outlier(default_engine: Engine, noisy_crease: np.ndarray) -> None:
+    points = np.vstack([noisy_crease, [[0.5, 0.5, 3.0], [3.0, -2.0, 0.5]]])
+    filtered, _ = filter_cloud(PointCloud(points), default_engine, columns=["outlier"])
+    outlier = filtered.column_values(["scalar_outlier"])[:, 0]
+    np.testing.assert_array_equal(outlier[600:], 1)
+    assert outlier[:600].mean() < 0.1
+    unmoved, _ = filter_cloud(PointCloud(points), default_engine, columns=["outlier"], strength=0.0)
+    np.testing.assert_array_equal(unmoved.column_values(["scalar_outlier"])[:, 0], outlier)
+
+
+def test_errors_are_not_known_of_shortened_moves(default_engine: Engine, noisy_crease: np.ndarray) -> None:
+    cloud = PointCloud(noisy_crease.copy())
+    full = filter_cloud(cloud, default_engine, columns=COLUMNS)[0].column_values(FIGURES)
+    limit = float(np.median(full[:, 0]))
+    limited = filter_cloud(cloud, default_engine, columns=COLUMNS, max_move=limit)[0].column_values(FIGURES)
+    known = full[:, 0] <= limit
+    np.testing.assert_array_equal(limited[known, 1], full[known, 1])
+    assert np.isnan(limited[~known, 1]).all()
+    np.testing.assert_array_equal(limited[:, 2], full[:, 2])
+
+
+def test_figures_of_a_network_that_does_not_tell_its_errors(engine: Engine, noisy_crease: np.ndarray) -> None:
+    cloud = PointCloud(noisy_crease.copy())
+    filtered, report = filter_cloud(cloud, engine, columns=COLUMNS, radius=Radius(0.2, relative=False))
+    figures = filtered.column_values(FIGURES)
+    assert np.isnan(figures[:, 1]).all()
+    np.testing.assert_array_equal(figures[:, 2], 0)
+    assert report.warnings == ("no expected error is known of any point, so scalar_uncertainty is NaN everywhere",)
+
+
+def test_columns_that_are_there_already_are_refused(engine: Engine, noisy_crease: np.ndarray, tmp_path: Path) -> None:
+    cloud = PointCloud.read(scan(tmp_path, noisy_crease))
+    once = through(filter_cloud(cloud, engine, columns=["displacement"])[0], tmp_path)
+    with pytest.raises(ParameterError, match=r"scalar_displacement already.*leave displacement out"):
+        filter_cloud(once, engine, columns=COLUMNS)
+    assert filter_cloud(once, engine, columns=["outlier"])[0].column_types["scalar_outlier"] is not None

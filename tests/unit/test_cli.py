@@ -85,6 +85,17 @@ def test_normals_reach_the_filter(noisy_file: Path, tmp_path: Path, capsys: Capt
     assert "adaptive model" in refused(capsys, 2, "filter", noisy_file, tmp_path / "b.ply", "--normals", "recompute")
 
 
+def test_columns_reach_the_filter(noisy_file: Path, tmp_path: Path, capsys: Capture) -> None:
+    assert run("filter", noisy_file, tmp_path / "a.ply", "--json", "--columns", "outlier,displacement") == 0
+    report = json.loads(capsys.readouterr().out)
+    cloud = PointCloud.read(tmp_path / "a.ply")
+    assert list(cloud.column_types)[4:] == ["scalar_displacement", "scalar_outlier"]
+    assert cloud.column_values(["scalar_displacement"]).max() == pytest.approx(report["largest_displacement"])
+    assert "got 'colour'" in refused(capsys, 2, "filter", noisy_file, tmp_path / "b.ply", "--columns", "colour")
+    again = refused(capsys, 2, "filter", tmp_path / "a.ply", tmp_path / "b.ply", "--columns", "outlier")
+    assert "scalar_outlier" in again
+
+
 def test_the_paper_s_mode_of_an_adaptive_bundle(noisy_file: Path, tmp_path: Path, capsys: Capture) -> None:
     reports = []
     for options in ([], ["--paper"]):
