@@ -14,6 +14,7 @@ from pointfilter.errors import ParameterError
 from pointfilter.filter import Filtered
 from pointfilter.models import DEFAULT_MODEL, ModelBundle
 from pointfilter.network import MIN_NEIGHBOURS
+from pointfilter.noise import bounding_box_centre
 
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -95,8 +96,7 @@ def with_normals(
 def signed(normals: Float64, old: Float64, points: Float64) -> Float64:
     """The normals (n, 3), each on the side of the old one (n, 3); where that is 0, not finite or perpendicular, away
     from the centre of the bounding box of the points (n, 3)."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    outward = np.einsum("ij,ij->i", normals, points - (low + (high - low) / 2))
+    outward = np.einsum("ij,ij->i", normals, points - bounding_box_centre(points))
     agreement = np.einsum("ij,ij->i", normals, np.nan_to_num(old, nan=0.0, posinf=0.0, neginf=0.0))
     return np.where((np.where(agreement == 0, outward, agreement) < 0)[:, None], -normals, normals)
 

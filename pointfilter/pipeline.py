@@ -22,7 +22,7 @@ from pointfilter.attributes import (
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import ParameterError
-from pointfilter.filter import Filtered, filter_points, resolve_radius
+from pointfilter.filter import filter_points, resolve_radius
 from pointfilter.network import MIN_NEIGHBOURS
 
 COARSE_STEP = 0.05  # of the median ball: larger steps of the file's coordinates are worth a warning
@@ -163,7 +163,7 @@ def filter_cloud(
     xyz[finite] = filtered
     clean, on_normals = with_normals(cloud.with_xyz(xyz), normals, finite, result, displacements)
     clean, on_columns = with_figures(clean, columns, finite, points, result, displacements)
-    low, middle, high = _percentiles(result.radii)
+    low, middle, high = percentiles(result.radii)
     told = np.isfinite(result.errors)
     report = Report(
         model=bundle.name,
@@ -184,7 +184,7 @@ def filter_cloud(
         mean_displacement=float(displacements.mean()),
         largest_displacement=float(displacements.max()),
         seconds={**result.seconds, "total": time.perf_counter() - started},
-        warnings=(*_warnings(cloud, points, result), *on_normals, *on_columns),
+        warnings=(*input_warnings(cloud, points, result.placeholder_rows, result.radii), *on_normals, *on_columns),
     )
     return clean, report
 
@@ -201,7 +201,8 @@ def limited(
     return points + moves
 
 
-def _percentiles(radii: NDArray[np.float64]) -> tuple[float, float, float]:
+def percentiles(radii: NDArray[np.float64]) -> tuple[float, float, float]:
+    """5th, 50th and 95th of those that are finite; 0 where none is."""
     taken = radii[np.isfinite(radii)]
     if not len(taken):
         return 0.0, 0.0, 0.0
@@ -209,17 +210,21 @@ def _percentiles(radii: NDArray[np.float64]) -> tuple[float, float, float]:
     return float(low), float(middle), float(high)
 
 
-def _warnings(cloud: PointCloud, points: NDArray[np.float64], result: Filtered) -> tuple[str, ...]:
+def input_warnings(
+    cloud: PointCloud, points: NDArray[np.float64], placeholder_rows: int, radii: NDArray[np.float64]
+) -> tuple[str, ...]:
+    """What the cloud itself makes worth knowing, a sentence each. points: (m, 3), its finite rows. radii: of their
+    balls, NaN where there is none."""
     warnings = []
-    if result.placeholder_rows:
+    if placeholder_rows:
         warnings.append(
-            f"{result.placeholder_rows} rows share places that hold many more rows than their surroundings, as where a "
-            "scanner writes 0 0 0 for no measurement; they were left as they were"
+            f"{placeholder_rows} rows share places that hold many more rows than their surroundings, as where a "
+            "scanner writes 0 0 0 for no measurement; the filter leaves them as they are"
         )
-    if not np.isfinite(result.radii).any():
-        warnings.append("there are too few points for the smallest ball; the cloud was left as it was")
+    taken = radii[np.isfinite(radii)]
+    if not len(taken):
+        warnings.append("there are too few points for the smallest ball; the filter leaves the cloud as it is")
     step = _storage_step(cloud, points)
-    taken = result.radii[np.isfinite(result.radii)]
     if len(taken) and step > COARSE_STEP * float(np.median(taken)):
         warnings.append(
             f"the file keeps coordinates as float32, in steps of {step:.3g} where they are largest, which is coarse "
