@@ -15,8 +15,8 @@ from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import PointfilterError
 from pointfilter.filter import Filtered, filter_points
+from pointfilter.inspection import Look, look
 from pointfilter.limits import ReadLimits
-from pointfilter.look import Look, look
 from pointfilter.models import ModelBundle, available_models, find_model, load_bundle
 from pointfilter.pipeline import Radius, Report, filter_cloud
 

@@ -29,7 +29,7 @@ from pointfilter.engine import DEVICES, Engine, available_cpus
 from pointfilter.evaluation import evaluate
 from pointfilter.formats import FORMATS, format_of
 from pointfilter.formats.ply_header import ENCODINGS
-from pointfilter.look import CANNOT_TELL, look
+from pointfilter.inspection import CANNOT_TELL, look
 from pointfilter.models import (
     DEFAULT_MODEL,
     available_models,

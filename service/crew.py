@@ -16,7 +16,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 
 from pointfilter.errors import FilteringCancelledError
-from pointfilter.look import Look
+from pointfilter.inspection import Look
 from service import worker
 from service.errors import WorkerDiedError
 from service.exchange import current_request_id

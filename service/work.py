@@ -22,8 +22,8 @@ from pointfilter.engine import Engine
 from pointfilter.errors import FilteringCancelledError, InputError, LimitExceededError
 from pointfilter.filter import STAGES
 from pointfilter.formats.ply_header import read_header
+from pointfilter.inspection import Look, look
 from pointfilter.limits import ReadLimits
-from pointfilter.look import Look, look
 from pointfilter.pipeline import Radius, Report, filter_cloud
 from service.errors import ClientGoneError
 

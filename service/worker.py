@@ -19,7 +19,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from pointfilter.engine import Engine
-from pointfilter.look import Look
+from pointfilter.inspection import Look
 from service.engines import Engines
 from service.exchange import current_request_id
 from service.logs import configure_logging

@@ -6,7 +6,7 @@ from functools import partial
 
 from fastapi import APIRouter, Request
 
-from pointfilter.look import Look
+from pointfilter.inspection import Look
 from service.dependencies import AdmittedFolder, ExchangeDep, HouseDep, Ready
 from service.intake import UPLOAD_CODES
 from service.ordering import LookOrderDep

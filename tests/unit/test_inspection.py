@@ -9,7 +9,7 @@ import pytest
 
 from pointfilter import Engine, PointCloud, filter_cloud, look
 from pointfilter.errors import DegenerateCloudError, FilteringCancelledError, TooFewPointsError
-from pointfilter.look import CANNOT_TELL, CLEAN, LEAST_WITH_BALL, NOISY, verdict
+from pointfilter.inspection import CANNOT_TELL, CLEAN, LEAST_WITH_BALL, NOISY, verdict
 from tests.clouds import crease
 
 
