@@ -15,6 +15,7 @@ from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import PointfilterError
 from pointfilter.filter import Filtered, filter_points
+from pointfilter.inspection import Look, look
 from pointfilter.limits import ReadLimits
 from pointfilter.models import ModelBundle, available_models, find_model, load_bundle
 from pointfilter.pipeline import Radius, Report, filter_cloud
@@ -27,6 +28,7 @@ except PackageNotFoundError:  # pragma: no cover - a source tree that was never 
 __all__ = [
     "Engine",
     "Filtered",
+    "Look",
     "ModelBundle",
     "PointCloud",
     "PointfilterError",
@@ -39,4 +41,5 @@ __all__ = [
     "filter_points",
     "find_model",
     "load_bundle",
+    "look",
 ]

@@ -23,11 +23,13 @@ from typing import Any
 
 import pointfilter
 from pointfilter import errors
+from pointfilter.attributes import COLUMNS, KEEP, NORMALS, parse_columns
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import DEVICES, Engine, available_cpus
 from pointfilter.evaluation import evaluate
 from pointfilter.formats import FORMATS, format_of
 from pointfilter.formats.ply_header import ENCODINGS
+from pointfilter.inspection import CANNOT_TELL, look
 from pointfilter.models import (
     DEFAULT_MODEL,
     available_models,
@@ -101,6 +103,18 @@ def build_parser() -> argparse.ArgumentParser:
         action="store_true",
         help="the paper's mode: balls of 5%% of the diagonal, two passes, all points move",
     )
+    command.add_argument(
+        "--normals",
+        default=KEEP,
+        choices=NORMALS,
+        help="columns nx ny nz: keep them, write the network's, or leave them out (default: %(default)s)",
+    )
+    command.add_argument(
+        "--columns",
+        default="",
+        metavar="C",
+        help=f"columns to add, separated by commas, of {', '.join(COLUMNS)} (default: none)",
+    )
     command.add_argument("--seed", type=int, default=0, metavar="S", help="of the downsampling (default: %(default)s)")
     command.add_argument("--device", default="auto", help=f"auto, {', '.join(DEVICES)} (default: %(default)s)")
     command.add_argument("--threads", type=int, default=0, metavar="T", help="default: all that this process may use")
@@ -111,8 +125,12 @@ def build_parser() -> argparse.ArgumentParser:
     command.add_argument("--quiet", action="store_true", help="no progress")
     command.set_defaults(run=_filter)
 
-    command = commands.add_parser("info", help="what is in a file")
+    command = commands.add_parser("info", help="what is in a file, how noisy it is, and what the filter would do")
     command.add_argument("input", metavar="FILE", type=Path)
+    command.add_argument("--brief", action="store_true", help="what is in the file only: no model is asked")
+    command.add_argument("--model", help=f"a bundle's name or folder (default: {DEFAULT_MODEL})")
+    command.add_argument("--device", default="auto", help=f"auto, {', '.join(DEVICES)} (default: %(default)s)")
+    command.add_argument("--threads", type=int, default=0, metavar="T", help="default: all that this process may use")
     command.add_argument("--json", action="store_true")
     command.set_defaults(run=_info)
 
@@ -141,6 +159,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _filter(options: argparse.Namespace) -> int:
     radius = Radius.parse(options.radius) if options.radius is not None else None
+    columns = parse_columns(options.columns)
     engine = Engine(open_model(options.model, model_folders()), options.device, options.threads)
     to_stdout = options.output == "-"
     for source, target in _pairs(options.input, options.output):
@@ -156,6 +175,8 @@ def _filter(options: argparse.Namespace) -> int:
                     strength=options.strength,
                     max_move=options.max_move,
                     paper=options.paper,
+                    normals=options.normals,
+                    columns=columns,
                     progress=progress,
                 )
             filtered.write(result, options.format, report.comment)
@@ -273,8 +294,19 @@ def _info(options: argparse.Namespace) -> int:
         "diagonal": bounding_box_diagonal(finite),
         **(cloud.source.summary if cloud.source else {}),
     }
+    if not options.brief:
+        engine = Engine(open_model(options.model, model_folders()), options.device, options.threads)
+        described.update(_looked(cloud, engine))
     _show(described, options.json)
     return 0
+
+
+def _looked(cloud: PointCloud, engine: Engine) -> dict[str, Any]:
+    """What the filter would do; a cloud that it refuses has a verdict and a warning only."""
+    try:
+        return look(cloud, engine).as_dict()
+    except errors.InputError as error:
+        return {"verdict": CANNOT_TELL, "warnings": [str(error)]}
 
 
 def _evaluate(options: argparse.Namespace) -> int:
@@ -354,7 +386,7 @@ def _show(described: dict[str, Any], as_json: bool) -> None:
             for key, entry in value.items():
                 text = f"{entry['count']} × {', '.join(entry['properties'])}" if isinstance(entry, dict) else entry
                 print(f"{name.ljust(width)}  {_printable(key)}: {_printable(str(text))}")
-        elif isinstance(value, list) and value and isinstance(value[0], str):
+        elif isinstance(value, list | tuple) and value and isinstance(value[0], str):
             print(f"{name.ljust(width)}  " + ("\n" + " " * (width + 2)).join(map(_printable, value)))
         else:
             print(f"{name.ljust(width)}  {value}")

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pointfilter.adaptive.balls import choose_balls
+from pointfilter.adaptive.balls import choose_balls, has_balls
 from pointfilter.adaptive.calibration import Calibration
-from pointfilter.adaptive.places import NEIGHBOURS, distinct_places, neighbourhood_keys
+from pointfilter.adaptive.places import distinct_places, neighbourhood_keys
 from pointfilter.errors import DegenerateCloudError, FilteringCancelledError, ParameterError, TooFewPointsError
 from pointfilter.grids import Grids
 from pointfilter.network import MIN_NEIGHBOURS, Network, answers, patches_per_batch
-from pointfilter.noise import bounding_box_diagonal
+from pointfilter.noise import bounding_box_centre, bounding_box_diagonal
 from pointfilter.patches import SMALLEST_RADIUS, NeighbourIndex, UInt64, mixed, sampling_key
 from pointfilter.ranges import numbers_of_ranges, over_ranges
 
@@ -105,7 +105,7 @@ def filter_points(
 
     Raises TooFewPointsError, DegenerateCloudError, ParameterError, FilteringCancelledError.
     """
-    points = _checked(points, iterations, seed, patch_points, threads)
+    points = checked(points, iterations, seed, patch_points, threads)
     if calibration is None:
         radius = resolve_radius(points, radius)
         passes = DEFAULT_ITERATIONS if iterations is None else iterations
@@ -120,15 +120,14 @@ def filter_points(
 
     clock = _Clock()
     if origin is None:  # large coordinates must not cost digits
-        low, high = points.min(axis=0), points.max(axis=0)
-        origin = low + (high - low) / 2
+        origin = bounding_box_centre(points)
     with clock.measure("index"):
         places = distinct_places(points - origin)
         keys, reach = neighbourhood_keys(places.points, threads)
     state = _State(places.points, keys)
     if radius is not None:
         state.radii[:] = radius
-    elif calibration is not None and len(places.points) > max(calibration.balls[0], NEIGHBOURS):
+    elif calibration is not None and has_balls(len(places.points), calibration):
         with clock.measure("balls"):
             key = sampling_key(seed, 0)
             state.radii[:], gains = choose_balls(
@@ -380,7 +379,7 @@ def resolve_radius(points: Float64, radius: float | None, fraction: float = DEFA
     return diagonal * fraction
 
 
-def _checked(points: Float64, iterations: int | None, seed: int, patch_points: int, threads: int) -> Float64:
+def checked(points: Float64, iterations: int | None, seed: int, patch_points: int, threads: int) -> Float64:
     """The points as float64. Raises TooFewPointsError, ParameterError, ValueError."""
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:

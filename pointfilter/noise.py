@@ -23,6 +23,13 @@ def bounding_box_diagonal(points: Float64) -> float:
         return float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))) if len(points) else 0.0
 
 
+def bounding_box_centre(points: Float64) -> Float64:
+    """The middle (3,) of the axis-aligned bounding box of (n, 3) points, n above 0."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre: Float64 = low + (high - low) / 2
+    return centre
+
+
 def add_noise(
     points: Float64,
     level: float,

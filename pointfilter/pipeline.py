@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pointfilter.attributes import (
+    KEEP,
+    check_new_columns,
+    check_normal_columns,
+    check_normals,
+    checked_columns,
+    with_figures,
+    with_normals,
+)
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import ParameterError
-from pointfilter.filter import Filtered, filter_points, resolve_radius
+from pointfilter.filter import filter_points, resolve_radius
 from pointfilter.network import MIN_NEIGHBOURS
 
 COARSE_STEP = 0.05  # of the median ball: larger steps of the file's coordinates are worth a warning
@@ -99,6 +108,8 @@ def filter_cloud(
     strength: float = 1.0,
     max_move: float | None = None,
     paper: bool = False,
+    normals: str = KEEP,
+    columns: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> tuple[PointCloud, Report]:
@@ -106,8 +117,14 @@ def filter_cloud(
 
     iterations: most passes. radius: of all balls; by default the network chooses, point by point. strength: factor of
     each displacement, from 0 to 1. max_move: longest displacement of a point, in the unit of the file, applied after
-    strength. paper: the paper's mode, for bundles that have another one. See filter.filter_points for progress,
-    cancelled and what is raised.
+    strength. paper: the paper's mode, for bundles that have another one. normals: of attributes.NORMALS, what becomes
+    of the columns nx, ny and nz: "keep" leaves them, "recompute" writes the network's normals of the filtered points
+    (unit length, on the side of the old normal, else away from the centre of the bounding box; a row without an answer
+    keeps its old normal, or gets 0 0 0), "drop" leaves the columns out. columns: some of attributes.COLUMNS,
+    each of which adds a column (see attributes.with_figures): "displacement", "uncertainty", "outlier".
+
+    See filter.filter_points for progress, cancelled and what is raised; ParameterError is raised for normals that
+    cannot be recomputed and for columns that the cloud has already, too.
     """
     started = time.perf_counter()
     if not 0 <= strength <= 1:
@@ -117,6 +134,10 @@ def filter_cloud(
             f"max_move must be a length above 0 in the unit of the file, got {max_move:g}", actual=max_move
         )
     bundle = engine.bundle
+    check_normals(normals, bundle, paper)
+    check_normal_columns(cloud, normals)
+    columns = checked_columns(columns)
+    check_new_columns(cloud, columns)
     finite = cloud.finite
     points = cloud.xyz[finite]
     absolute = None
@@ -140,7 +161,9 @@ def filter_cloud(
     displacements = np.linalg.norm(filtered - points, axis=1)
     xyz = cloud.xyz.copy()
     xyz[finite] = filtered
-    low, middle, high = _percentiles(result.radii)
+    clean, on_normals = with_normals(cloud.with_xyz(xyz), normals, finite, result, displacements)
+    clean, on_columns = with_figures(clean, columns, finite, points, result, displacements)
+    low, middle, high = percentiles(result.radii)
     told = np.isfinite(result.errors)
     report = Report(
         model=bundle.name,
@@ -161,9 +184,9 @@ def filter_cloud(
         mean_displacement=float(displacements.mean()),
         largest_displacement=float(displacements.max()),
         seconds={**result.seconds, "total": time.perf_counter() - started},
-        warnings=_warnings(cloud, points, result),
+        warnings=(*input_warnings(cloud, points, result.placeholder_rows, result.radii), *on_normals, *on_columns),
     )
-    return cloud.with_xyz(xyz), report
+    return clean, report
 
 
 def limited(
@@ -178,7 +201,8 @@ def limited(
     return points + moves
 
 
-def _percentiles(radii: NDArray[np.float64]) -> tuple[float, float, float]:
+def percentiles(radii: NDArray[np.float64]) -> tuple[float, float, float]:
+    """5th, 50th and 95th of those that are finite; 0 where none is."""
     taken = radii[np.isfinite(radii)]
     if not len(taken):
         return 0.0, 0.0, 0.0
@@ -186,17 +210,21 @@ def _percentiles(radii: NDArray[np.float64]) -> tuple[float, float, float]:
     return float(low), float(middle), float(high)
 
 
-def _warnings(cloud: PointCloud, points: NDArray[np.float64], result: Filtered) -> tuple[str, ...]:
+def input_warnings(
+    cloud: PointCloud, points: NDArray[np.float64], placeholder_rows: int, radii: NDArray[np.float64]
+) -> tuple[str, ...]:
+    """What the cloud itself makes worth knowing, a sentence each. points: (m, 3), its finite rows. radii: of their
+    balls, NaN where there is none."""
     warnings = []
-    if result.placeholder_rows:
+    if placeholder_rows:
         warnings.append(
-            f"{result.placeholder_rows} rows share places that hold many more rows than their surroundings, as where a "
-            "scanner writes 0 0 0 for no measurement; they were left as they were"
+            f"{placeholder_rows} rows share places that hold many more rows than their surroundings, as where a "
+            "scanner writes 0 0 0 for no measurement; the filter leaves them as they are"
         )
-    if not np.isfinite(result.radii).any():
-        warnings.append("there are too few points for the smallest ball; the cloud was left as it was")
+    taken = radii[np.isfinite(radii)]
+    if not len(taken):
+        warnings.append("there are too few points for the smallest ball; the filter leaves the cloud as it is")
     step = _storage_step(cloud, points)
-    taken = result.radii[np.isfinite(result.radii)]
     if len(taken) and step > COARSE_STEP * float(np.median(taken)):
         warnings.append(
             f"the file keeps coordinates as float32, in steps of {step:.3g} where they are largest, which is coarse "

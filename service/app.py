@@ -14,7 +14,7 @@ from service.handlers import install_handlers
 from service.house import House
 from service.middleware import ExchangeMiddleware
 from service.problems import Problem
-from service.routes import about, filter, health, jobs, pages  # noqa: A004 - named after what it routes
+from service.routes import about, filter, health, jobs, look, pages  # noqa: A004 - named after what it routes
 from service.settings import Settings
 from service.tracing import tracing
 
@@ -41,7 +41,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.house = house
     app.add_middleware(ExchangeMiddleware, house=house)
     install_handlers(app)
-    for router in (filter.router, jobs.router, health.router, about.router, pages.router):
+    for router in (filter.router, look.router, jobs.router, health.router, about.router, pages.router):
         app.include_router(router)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

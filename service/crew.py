@@ -16,12 +16,13 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 
 from pointfilter.errors import FilteringCancelledError
+from pointfilter.inspection import Look
 from service import worker
 from service.errors import WorkerDiedError
 from service.exchange import current_request_id
 from service.hands import Hand, start_process
 from service.settings import Settings
-from service.work import Delivery, Order
+from service.work import Delivery, LookOrder, Order
 
 log = logging.getLogger("service.workers")
 
@@ -102,7 +103,20 @@ class Crew:
 
         Raises what the work raised, and WorkerDiedError when workers died of it.
         """
-        task = worker.Task(order, source, target, current_request_id.get())
+        delivery = self._have_done(worker.Task(order, source, target, current_request_id.get()), stop, progress)
+        assert isinstance(delivery, Delivery)  # noqa: S101 - what an Order gives
+        return delivery
+
+    def look(self, order: LookOrder, source: Path, stop: threading.Event) -> Look:
+        """work.look_over by a free worker, as carry_out does it."""
+        task = worker.Task(order, source, None, current_request_id.get())
+        looked = self._have_done(task, stop, lambda _done, _total, _points: None)
+        assert isinstance(looked, Look)  # noqa: S101 - what a LookOrder gives
+        return looked
+
+    def _have_done(
+        self, task: worker.Task, stop: threading.Event, progress: Callable[[int, int, int], None]
+    ) -> Delivery | Look:
         attempt = 0
         while attempt < ATTEMPTS:
             hand = self._take(stop)
@@ -124,7 +138,7 @@ class Crew:
             if isinstance(answer, worker.Failed):
                 raise answer.error
             self._note(hand, answer.loaded)
-            return answer.delivery
+            return answer.result
         raise WorkerDiedError(
             f"{ATTEMPTS} workers died of this file, one after the other", limit=ATTEMPTS, retry_after=RETRY_SECONDS
         )

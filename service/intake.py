@@ -18,11 +18,12 @@ from service.status import JobStatus, described
 from service.upload import Upload, adopt, receive_upload
 from service.work import Order, is_small, to_the_end
 
-JOB_CODES = (
+UPLOAD_CODES = (
     "malformed-request", "unauthorized", "model-not-found", "slow-transfer", "limit-exceeded", "unsupported-coding",
-    "parameter-out-of-range", "queue-full", "jobs-full", "client-closed", "internal-error", "invalid-model",
-    "not-ready", "draining", "storage-full",
+    "parameter-out-of-range", "queue-full", "client-closed", "internal-error", "invalid-model", "not-ready",
+    "draining", "storage-full",
 )  # fmt: skip
+JOB_CODES = (*UPLOAD_CODES, "jobs-full")
 _HEADERS = {"Location": {"description": "Address of the job", "schema": {"type": "string"}}}
 ACCEPTED: dict[str, Any] = {
     "description": "Accepted: the job's status, and its address in Location",

@@ -4,23 +4,48 @@ from __future__ import annotations
 
 import asyncio
 import re
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from fastapi import Depends, Query
 
+from pointfilter.attributes import check_normals, parse_columns
 from pointfilter.errors import ParameterError
-from pointfilter.models import AUTO
+from pointfilter.models import AUTO, ModelBundle
 from pointfilter.pipeline import Radius
 from service.dependencies import CallerDep, ExchangeDep, HouseDep
 from service.settings import variable
-from service.work import Order
+from service.work import LookOrder, Order
 
 
-async def _order(
+@dataclass(frozen=True)
+class Chosen:
+    """The model that is asked for: its name as the service knows it, and its bundle."""
+
+    name: str
+    bundle: ModelBundle
+
+
+async def _chosen(
     house: HouseDep,
     exchange: ExchangeDep,
     _caller: CallerDep,
     model: Annotated[str | None, Query(description="A name from /models", max_length=100)] = None,
+) -> Chosen:
+    """Raises ModelError."""
+    name = model or house.settings.model
+    bundle = await asyncio.to_thread(house.engines.bundle, name)
+    exchange.model = bundle.name
+    return Chosen(name, bundle)
+
+
+ChosenDep = Annotated[Chosen, Depends(_chosen)]
+Seed = Annotated[int, Query(description="Of the choice of neighbours in dense patches", ge=0, lt=2**63)]
+
+
+async def _order(
+    house: HouseDep,
+    chosen: ChosenDep,
     iterations: Annotated[
         str | None,
         Query(
@@ -36,7 +61,7 @@ async def _order(
             max_length=40,
         ),
     ] = None,
-    seed: Annotated[int, Query(description="Of the choice of neighbours in dense patches", ge=0, lt=2**63)] = 0,
+    seed: Seed = 0,
     format: Annotated[  # noqa: A002 - the parameter's public name
         Literal["same", "ascii", "binary_little_endian", "binary_big_endian"],
         Query(description="Encoding of the answer"),
@@ -52,12 +77,26 @@ async def _order(
     paper: Annotated[
         bool, Query(description="The paper's mode: balls of 5 % of the bounding box's diagonal, two passes")
     ] = False,
+    normals: Annotated[
+        Literal["keep", "recompute", "drop"],
+        Query(
+            description="Columns nx, ny and nz: keep them as they are, write the network's normals of the filtered "
+            "points, or leave the columns out"
+        ),
+    ] = "keep",
+    columns: Annotated[
+        str,
+        Query(
+            description="Columns to add, separated by commas: displacement (length of the move), uncertainty (expected "
+            "distance to the surface), outlier (1 or 0); scalar_ stands before each name in the file",
+            max_length=100,
+        ),
+    ] = "",
 ) -> Order:
     """Raises ParameterError, ModelError."""
-    bundle = await asyncio.to_thread(house.engines.bundle, model or house.settings.model)
-    exchange.model = bundle.name
+    check_normals(normals, chosen.bundle, paper)
     return Order(
-        model=model or house.settings.model,
+        model=chosen.name,
         iterations=None if iterations is None else _iterations(iterations, house.settings.max_iterations),
         radius=None if radius is None else Radius.parse(radius),
         seed=seed,
@@ -65,10 +104,20 @@ async def _order(
         strength=strength,
         max_move=max_move,
         paper=paper,
+        normals=normals,
+        columns=parse_columns(columns),
     )
 
 
 OrderDep = Annotated[Order, Depends(_order)]
+
+
+async def _look_order(chosen: ChosenDep, seed: Seed = 0) -> LookOrder:
+    """Raises ParameterError, ModelError."""
+    return LookOrder(model=chosen.name, seed=seed)
+
+
+LookOrderDep = Annotated[LookOrder, Depends(_look_order)]
 
 
 def _iterations(text: str, most: int) -> int | None:

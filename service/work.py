@@ -16,11 +16,13 @@ from typing import TypeVar
 
 from starlette.requests import Request
 
+from pointfilter.attributes import KEEP
 from pointfilter.cloud import PointCloud
 from pointfilter.engine import Engine
 from pointfilter.errors import FilteringCancelledError, InputError, LimitExceededError
 from pointfilter.filter import STAGES
 from pointfilter.formats.ply_header import read_header
+from pointfilter.inspection import Look, look
 from pointfilter.limits import ReadLimits
 from pointfilter.pipeline import Radius, Report, filter_cloud
 from service.errors import ClientGoneError
@@ -43,6 +45,16 @@ class Order:
     strength: float = 1.0
     max_move: float | None = None
     paper: bool = False
+    normals: str = KEEP
+    columns: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class LookOrder:
+    """What to look at a cloud with: the request's parameters, checked."""
+
+    model: str
+    seed: int
 
 
 @dataclass(frozen=True)
@@ -86,6 +98,8 @@ def carry_out(
         strength=order.strength,
         max_move=order.max_move,
         paper=order.paper,
+        normals=order.normals,
+        columns=order.columns,
         progress=lambda done, total: progress(done, total, points),
         cancelled=stopped,
     )
@@ -97,6 +111,21 @@ def carry_out(
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     seconds["write"] = time.perf_counter() - started
     return Delivery(report, sha256, target.stat().st_size, seconds)
+
+
+def look_over(
+    order: LookOrder,
+    source: Path,
+    find_engine: Callable[[str], Engine],
+    limits: ReadLimits,
+    stopped: Callable[[], bool],
+) -> Look:
+    """Reads `source` and looks at it. Gives up, and raises, as carry_out does."""
+    _go_on(stopped)
+    engine = find_engine(order.model)
+    cloud = PointCloud.read(source, limits)
+    _go_on(stopped)
+    return look(cloud, engine, seed=order.seed, cancelled=stopped)
 
 
 def _go_on(stopped: Callable[[], bool]) -> None:

@@ -19,11 +19,12 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from pointfilter.engine import Engine
+from pointfilter.inspection import Look
 from service.engines import Engines
 from service.exchange import current_request_id
 from service.logs import configure_logging
 from service.settings import Settings
-from service.work import Delivery, Order, carry_out
+from service.work import Delivery, LookOrder, Order, carry_out, look_over
 
 PROGRESS_SECONDS = 0.1  # how often it says how far it is
 OUT_OF_MEMORY_SCORE = 500  # the kernel is to take a worker before it takes the service
@@ -31,11 +32,11 @@ OUT_OF_MEMORY_SCORE = 500  # the kernel is to take a worker before it takes the 
 
 @dataclass(frozen=True)
 class Task:
-    """To the worker. request_id: for its log."""
+    """To the worker. target: where the filtered file goes; None for a LookOrder. request_id: for its log."""
 
-    order: Order
+    order: Order | LookOrder
     source: Path
-    target: Path
+    target: Path | None
     request_id: str | None
 
 
@@ -74,7 +75,8 @@ class Progress:
 class Done:
     """From the worker."""
 
-    delivery: Delivery
+    result: Delivery | Look
+    """A Look for a LookOrder."""
     loaded: tuple[Loaded, ...]
 
 
@@ -143,14 +145,26 @@ def _answer(
             connection.send(Progress(done, total, points))
 
     try:
-        delivery = carry_out(
-            task.order, task.source, task.target, engines.engine, settings.read_limits, stop.is_set, progress
-        )
+        result = _result(task, engines, settings, stop, progress)
     except Exception as error:  # noqa: BLE001 - it goes to whoever asked
         return Failed(_portable(error))
     finally:
         current_request_id.reset(token)
-    return Done(delivery, _loaded(engines))
+    return Done(result, _loaded(engines))
+
+
+def _result(
+    task: Task,
+    engines: Engines,
+    settings: Settings,
+    stop: threading.Event,
+    progress: Callable[[int, int, int], None],
+) -> Delivery | Look:
+    """Raises what the work raises."""
+    if isinstance(task.order, LookOrder):
+        return look_over(task.order, task.source, engines.engine, settings.read_limits, stop.is_set)
+    assert task.target is not None  # noqa: S101 - an Order has one
+    return carry_out(task.order, task.source, task.target, engines.engine, settings.read_limits, stop.is_set, progress)
 
 
 def _loaded(engines: Engines) -> tuple[Loaded, ...]:

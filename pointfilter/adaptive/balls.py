@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pointfilter.adaptive.calibration import Calibration
+from pointfilter.adaptive.places import NEIGHBOURS
 from pointfilter.errors import InvalidModelError
 from pointfilter.grids import Grids
 from pointfilter.network import Network, answers
@@ -24,6 +26,31 @@ SPREAD = 4  # probes whose radii a point takes the mean of
 PROBES_PER_TASK = 64
 
 
+@dataclass(frozen=True, eq=False)
+class Probes:
+    """The best ball of each of k probes, points that stand for their neighbourhoods.
+
+    points: (k, 3). radii: (k,), inf where there is no ball. ball_points: (k,) int64, points in the ball. gains: (k,),
+    logarithm of the expected error as a share of the error without a filter. errors: (k,), expected distance to the
+    surface without a filter, in the unit of the points; NaN where there is no ball.
+    """
+
+    points: Float64
+    radii: Float64
+    ball_points: Int64
+    gains: Float64
+    errors: Float64
+
+    def near(self, points: Float64, threads: int) -> Int64:
+        """The SPREAD nearest probes of (n, 3) points: (n, at most SPREAD) int64."""
+        return _nearest(self.points, points, SPREAD, threads)
+
+
+def has_balls(count: int, calibration: Calibration) -> bool:
+    """Whether a cloud of so many distinct points has balls to choose from."""
+    return count > max(calibration.balls[0], NEIGHBOURS)
+
+
 def choose_balls(
     points: Float64,
     keys: UInt64,
@@ -35,13 +62,31 @@ def choose_balls(
     threads: int,
     check: Callable[[], None],
 ) -> tuple[Float64, Float64]:
-    """The radius (n,) of each point's ball, and the logarithm (n,) of the expected error there as a share of the error
-    without a filter: above 0 where the ball does not help.
+    """The radius (n,) of each point's ball, and the logarithm (n,) of the expected error there as a share of the
+    error without a filter: above 0 where the ball does not help. The arguments are those of probe_balls."""
+    probes = probe_balls(points, keys, reach, network, calibration, patch_points, key, threads, check)
+    near = probes.near(points, threads)
+    return np.exp(np.log(probes.radii)[near].mean(axis=1)), probes.gains[near].mean(axis=1)
 
-    Balls are compared by that share, as far as calibration.still_weight says: the error without a filter is the same for
-    all of them, so that what a ball knows wrongly cancels out; one that holds nothing but noise underestimates both.
 
-    points: (n, 3) distinct, more of them than the smallest ball holds. keys, reach: of neighbourhood_keys. One point in
+def probe_balls(
+    points: Float64,
+    keys: UInt64,
+    reach: Float64,
+    network: Network,
+    calibration: Calibration,
+    patch_points: int,
+    key: int,
+    threads: int,
+    check: Callable[[], None],
+) -> Probes:
+    """The best ball of one point in each neighbourhood.
+
+    Balls are compared by the expected error as a share of that without a filter, as far as calibration.still_weight
+    says: the error without a filter is the same for all balls, so that what a ball knows wrongly cancels out; one that
+    holds only noise underestimates both.
+
+    points: (n, 3) distinct, so many that has_balls is true. keys, reach: of neighbourhood_keys. One point in
     a neighbourhood is a probe: all balls of the calibration are evaluated for it. The expected errors are averaged over
     SMOOTHED probes, for the least of several estimates is biased, and the radii over SPREAD.
     """
@@ -72,14 +117,21 @@ def choose_balls(
         for _ in over_ranges(evaluate, len(rows), PROBES_PER_TASK, threads, check):
             pass
 
-    tree = cKDTree(points[probes])
-    _, near = tree.query(points[probes], k=np.arange(1, min(SMOOTHED, len(probes)) + 1), workers=threads)
-    gains, still = gains[near].mean(axis=1), still[near].mean(axis=1)
-    wanted = gains if calibration.still_weight == 1 else gains + (1 - calibration.still_weight) * still
+    places = points[probes]
+    near = _nearest(places, places, SMOOTHED, threads)
+    gains, smooth_still = gains[near].mean(axis=1), still[near].mean(axis=1)
+    wanted = gains if calibration.still_weight == 1 else gains + (1 - calibration.still_weight) * smooth_still
     doublings = np.log2(np.where(np.isfinite(radii), radii, 1.0) / np.maximum(reach[probes], SMALLEST_RADIUS)[:, None])
     wanted = wanted + calibration.preference * doublings
     best = len(sizes) - 1 - np.argmin(wanted[:, ::-1], axis=1)  # the larger at a tie
     rows = np.arange(len(probes))
-    log_radii = np.log(radii[rows, best])
-    _, near = tree.query(points, k=np.arange(1, min(SPREAD, len(probes)) + 1), workers=threads)
-    return np.exp(log_radii[near].mean(axis=1)), gains[rows, best][near].mean(axis=1)
+    taken = radii[rows, best]
+    errors = np.exp(still[rows, best], where=np.isfinite(taken), out=np.full(len(probes), np.nan))
+    return Probes(places, taken, sizes[best], gains[rows, best], errors)
+
+
+def _nearest(places: Float64, points: Float64, count: int, threads: int) -> Int64:
+    """The nearest of (k, 3) places of each of (n, 3) points: (n, count) int64, fewer columns where k is smaller."""
+    wanted = np.arange(1, min(count, len(places)) + 1)
+    nearest: Int64 = cKDTree(places).query(points, k=wanted, workers=threads)[1]
+    return nearest

@@ -1,4 +1,4 @@
-"""PLY in and out, byte for byte but for x, y and z.
+"""PLY in and out, byte for byte but for x, y and z and the columns that a cloud sets or drops.
 
 The file is not taken apart and put together again: the coordinates are read from its bytes and, on the way out, written
 into a copy of them. So other columns, lists, faces, comments, spelling and line endings cannot get lost, and what comes
@@ -14,8 +14,9 @@ import re
 import secrets
 import struct
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 
 from pointfilter.cloud import PointCloud
 from pointfilter.errors import LimitExceededError, MalformedFileError, ParameterError
+from pointfilter.formats.ply_columns import NEW_TYPE, ColumnEdit
 from pointfilter.formats.ply_convert import STRUCT_CODES, convert
 from pointfilter.formats.ply_header import ENCODINGS, TYPES, ByteOrder, Element, Header, Property, read_header, shown
 from pointfilter.limits import ReadLimits
@@ -52,6 +54,24 @@ class PlySource:
             property.name in "xyz" and property.type in ("float", "float32")
             for property in self.header.vertex.properties
         )
+
+    @property
+    def column_types(self) -> dict[str, np.dtype[Any] | None]:
+        return {
+            property.name: None if property.length_type else property.dtype("=")
+            for property in self.header.vertex.properties
+        }
+
+    def columns(self, names: Sequence[str]) -> Float64:
+        properties = _properties(self.header.vertex, names)
+        if self.header.encoding == "ascii":
+            return _text_columns(self, properties)
+        raw = np.frombuffer(self.data, np.uint8)
+        found = np.empty((self.header.vertex.count, len(names)), dtype=np.float64)
+        for number, (property, places) in enumerate(zip(properties, _places(self, names), strict=True)):
+            with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN
+                found[:, number] = _column(self, raw, property, places)
+        return found
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -119,7 +139,7 @@ def _read_binary(header: Header, data: mmap.mmap) -> PointCloud:
         begin = position
         wanted = element.name == "vertex"
         if element.has_lists:
-            position, found = _walk(element, header.order, data, position, wanted)
+            position, found = _walk(element, header.order, data, position, AXES if wanted else ())
             offsets = found if wanted else offsets
         else:
             position += element.count * element.smallest_row(ascii=False)
@@ -131,23 +151,32 @@ def _read_binary(header: Header, data: mmap.mmap) -> PointCloud:
         if wanted:
             start, stop = begin, position
     source = PlySource(header, data, start, stop, offsets)
-    xyz = np.empty((header.vertex.count, 3), dtype=np.float64)
-    for axis, property in enumerate(_axes(header.vertex)):
-        with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN
-            xyz[:, axis] = _column(source, np.frombuffer(data, np.uint8), axis, property)
-    return PointCloud(xyz, source)
+    return PointCloud(source.columns(AXES), source)
 
 
-def _axes(vertex: Element) -> list[Property]:
+def _properties(vertex: Element, names: Sequence[str]) -> list[Property]:
     found = {property.name: property for property in vertex.properties}
-    return [found[name] for name in AXES]
+    return [found[name] for name in names]
 
 
-def _column(source: PlySource, raw: NDArray[np.uint8], axis: int, property: Property) -> NDArray[Any]:
-    """The values of one coordinate: a view on the bytes, or a gathered copy where rows have lists."""
+def _places(source: PlySource, names: Sequence[str]) -> list[NDArray[np.int64] | None]:
+    """Byte positions (n,) of each of these columns, None where rows have no lists: there they follow from the row."""
+    if source.offsets is None:
+        return [None] * len(names)
+    offsets = source.offsets
+    if tuple(names) != AXES:
+        vertex, order = source.header.vertex, source.header.order
+        offsets = _walk(vertex, order, source.data, source.vertex_start, names)[1]
+    return list(offsets.T)
+
+
+def _column(
+    source: PlySource, raw: NDArray[np.uint8], property: Property, places: NDArray[np.int64] | None
+) -> NDArray[Any]:
+    """The values of one column: a view on the bytes, or a gathered copy where rows have lists."""
     dtype = property.dtype(source.header.order)
-    if source.offsets is not None:
-        rows = source.offsets[:, axis, None] + np.arange(dtype.itemsize)
+    if places is not None:
+        rows = places[:, None] + np.arange(dtype.itemsize)
         return raw[rows].view(dtype)[:, 0] if len(rows) else np.empty(0, dtype)
     vertex = source.header.vertex
     if vertex.count == 0:
@@ -159,16 +188,16 @@ def _column(source: PlySource, raw: NDArray[np.uint8], axis: int, property: Prop
 
 
 def _walk(
-    element: Element, order: ByteOrder, data: mmap.mmap, position: int, wanted: bool
-) -> tuple[int, NDArray[np.int64] | None]:
-    """Steps over rows with lists, checking every length against the file: (end, offsets of x, y, z where wanted)."""
+    element: Element, order: ByteOrder, data: mmap.mmap | bytes, position: int, wanted: Sequence[str]
+) -> tuple[int, NDArray[np.int64]]:
+    """Steps over rows with lists, checking every length against the file: (end, offsets (n, k) of wanted columns)."""
     size = len(data)
     steps = _steps(element, order)
-    coordinates = array("q")
+    found = array("q")
     for row in range(element.count):
         for name, length, item in steps:
-            if wanted and name in AXES:
-                coordinates.append(position)
+            if name in wanted:
+                found.append(position)
             if length is None:
                 position += item
                 continue
@@ -184,11 +213,9 @@ def _walk(
                 f"the file ends at byte {size}, in row {row} of element {shown(element.name)}",
                 hint="the file is truncated",
             )
-    if not wanted:
-        return position, None
-    in_order = [property.name for property in element.properties if property.name in AXES]
-    offsets = np.frombuffer(coordinates, np.int64).reshape(-1, 3)
-    return position, offsets[:, [in_order.index(name) for name in AXES]]
+    in_order = [property.name for property in element.properties if property.name in wanted]
+    offsets = np.frombuffer(found, np.int64).reshape(-1 if wanted else 0, len(wanted))
+    return position, offsets[:, [in_order.index(name) for name in wanted]]
 
 
 def _steps(element: Element, order: ByteOrder) -> list[tuple[str, struct.Struct | None, int]]:
@@ -214,7 +241,7 @@ def _read_ascii(header: Header, data: mmap.mmap) -> PointCloud:
     for element in header.elements:
         begin = position
         wanted = element.name == "vertex"
-        fields = _fields(element)
+        fields = _fields(element, AXES)
         for _ in range(element.count):
             end = data.find(b"\n", position)
             end = len(data) if end < 0 else end
@@ -230,7 +257,7 @@ def _read_ascii(header: Header, data: mmap.mmap) -> PointCloud:
             number += 1
             if position >= len(data):
                 raise MalformedFileError(f"line {number}: the file ends inside element {shown(element.name)}")
-            columns = _columns(tokens, element, fields, number)
+            columns = _columns(tokens, element, AXES, fields, number)
             if wanted:
                 try:
                     coordinates.extend([_number(tokens[columns[axis]]) for axis in range(3)])
@@ -240,10 +267,39 @@ def _read_ascii(header: Header, data: mmap.mmap) -> PointCloud:
         if wanted:
             start, stop = begin, min(position, len(data))
     xyz = np.frombuffer(coordinates, np.float64).reshape(-1, 3).copy()
-    for axis, property in enumerate(_axes(header.vertex)):  # a float property holds floats, however many digits it has
-        with np.errstate(over="ignore"):
-            xyz[:, axis] = xyz[:, axis].astype(TYPES[property.type])
-    return PointCloud(xyz, PlySource(header, data, start, stop))
+    return PointCloud(_in_their_types(xyz, _properties(header.vertex, AXES)), PlySource(header, data, start, stop))
+
+
+def _in_their_types(values: Float64, properties: list[Property]) -> Float64:
+    """A float property holds floats, however many digits its text has."""
+    for number, property in enumerate(properties):
+        values[:, number] = _cast(values[:, number], np.dtype(TYPES[property.type]))
+    return values
+
+
+def _text_columns(source: PlySource, properties: list[Property]) -> Float64:
+    """The values (n, k) of columns of a file that `read` has checked. Raises MalformedFileError."""
+    vertex = source.header.vertex
+    names = [property.name for property in properties]
+    fields = _fields(vertex, names)
+    found = np.empty((vertex.count, len(names)), dtype=np.float64)
+    for row, line in enumerate(_lines(source)):
+        tokens = line.split()
+        try:
+            found[row] = [_number(tokens[column]) for column in _columns(tokens, vertex, names, fields, row)]
+        except ValueError:
+            raise MalformedFileError(f"vertex {row}: {', '.join(map(shown, names))} must be numbers") from None
+    return _in_their_types(found, properties)
+
+
+def _lines(source: PlySource) -> Iterator[bytes]:
+    """The lines of the vertices, with their endings."""
+    position = source.vertex_start
+    for _ in range(source.header.vertex.count):
+        end = source.data.find(b"\n", position, source.vertex_stop)
+        end = source.vertex_stop if end < 0 else end + 1
+        yield source.data[position:end]
+        position = end
 
 
 def _number(text: bytes) -> float:
@@ -252,16 +308,18 @@ def _number(text: bytes) -> float:
     return float(text)
 
 
-def _fields(element: Element) -> list[int] | None:
-    """Columns of x, y and z where no list comes into it; None where rows must be walked."""
+def _fields(element: Element, names: Sequence[str]) -> list[int] | None:
+    """Numbers of the values of these columns where no list comes into it; None where rows must be walked."""
     if element.has_lists:
         return None
-    names = [property.name for property in element.properties]
-    return [names.index(name) if name in names else 0 for name in AXES]
+    known = [property.name for property in element.properties]
+    return [known.index(name) if name in known else 0 for name in names]
 
 
-def _columns(tokens: list[bytes], element: Element, fields: list[int] | None, number: int) -> list[int]:
-    """Columns of x, y and z in this row; checks that the row has as many values as its element says."""
+def _columns(
+    tokens: list[bytes], element: Element, names: Sequence[str], fields: list[int] | None, number: int
+) -> list[int]:
+    """Numbers of the values of these columns in this row; checks that the row has the values that its element says."""
     if fields is not None:
         if len(tokens) != len(element.properties):
             found = "more" if len(tokens) > len(element.properties) else f"{len(tokens)}"
@@ -281,7 +339,7 @@ def _columns(tokens: list[bytes], element: Element, fields: list[int] | None, nu
         column += 1
     if column != len(tokens):
         raise MalformedFileError(f"line {number}: {len(tokens)} values, the row's lists and properties need {column}")
-    return [places.get(name, 0) for name in AXES]
+    return [places.get(name, 0) for name in names]
 
 
 # --- writing --------------------------------------------------------------------------------------------------------
@@ -289,16 +347,18 @@ def _columns(tokens: list[bytes], element: Element, fields: list[int] | None, nu
 
 def _write_spliced(cloud: PointCloud, source: PlySource, file: BinaryIO, comment: str | None) -> None:
     header = source.header
+    edit = ColumnEdit.of(header.vertex, cloud.columns, cloud.dropped)
+    raw = edit.header(header.raw, header.ending)
     # Before the first element, where readers look for the comments on the whole file.
-    first = _ELEMENT_LINE.search(header.raw)
-    place = first.start() if first else len(header.raw)
-    file.write(header.raw[:place])
+    first = _ELEMENT_LINE.search(raw)
+    place = first.start() if first else len(raw)
+    file.write(raw[:place])
     if comment is not None:
         file.write(b"comment " + comment.encode() + header.ending)
-    file.write(header.raw[place:])
+    file.write(raw[place:])
     file.write(source.data[len(header.raw) : source.vertex_start])  # from the end_header line on
-    vertices = _spliced_ascii(cloud, source) if header.encoding == "ascii" else _spliced_binary(cloud, source)
-    for part in vertices:
+    splice = _spliced_ascii if header.encoding == "ascii" else _spliced_binary
+    for part in splice(cloud, source, edit):
         file.write(part)
     _copy(source.data, source.vertex_stop, file)
 
@@ -308,55 +368,68 @@ def _copy(data: mmap.mmap | bytes, start: int, file: BinaryIO, step: int = 1 << 
         file.write(data[position : position + step])
 
 
-def _spliced_binary(cloud: PointCloud, source: PlySource) -> Iterator[bytes | memoryview]:
-    """The vertex bytes with new coordinates; coordinates that did not change keep their bytes, NaN payloads too."""
+def _replaced(cloud: PointCloud, edit: ColumnEdit) -> dict[str, Float64]:
+    """New values (n,) of columns that the file has: x, y and z first."""
+    return {**dict(zip(AXES, cloud.xyz.T, strict=True)), **edit.replaced}
+
+
+def _spliced_binary(cloud: PointCloud, source: PlySource, edit: ColumnEdit) -> Iterator[bytes | memoryview]:
+    """The vertex bytes with new values; values that did not change keep their bytes, NaN payloads too."""
     raw = np.frombuffer(source.data, np.uint8)
     rows = np.array(raw[source.vertex_start : source.vertex_stop])
-    shift = source.vertex_start
-    local = PlySource(source.header, b"", 0, 0, None if source.offsets is None else source.offsets - shift)
-    for axis, property in enumerate(_axes(source.header.vertex)):
-        dtype = property.dtype(source.header.order)
-        old = _column(source, raw, axis, property)
-        values = _cast(cloud.xyz[:, axis], dtype)
+    vertex, order = source.header.vertex, source.header.order
+    local = PlySource(source.header, b"", 0, 0)
+    replaced = _replaced(cloud, edit)
+    places_of = dict(zip(AXES, _places(source, AXES), strict=True))
+    places_of.update(zip(edit.replaced, _places(source, list(edit.replaced)), strict=True))
+    for property in _properties(vertex, list(replaced)):
+        dtype, places = property.dtype(order), places_of[property.name]
+        old = _column(source, raw, property, places)
+        values = _cast(replaced[property.name], dtype)
         changed = (values != old) & np.isfinite(values)
-        if local.offsets is None:
-            column = _column(local, rows, axis, property)
-            column[changed] = values[changed]
+        if places is None:
+            _column(local, rows, property, None)[changed] = values[changed]
         else:
-            places = local.offsets[changed, axis, None] + np.arange(dtype.itemsize)
-            rows[places] = values[changed].astype(dtype).view(np.uint8).reshape(-1, dtype.itemsize)
-    yield rows.data
+            bytes_of = places[changed, None] - source.vertex_start + np.arange(dtype.itemsize)
+            rows[bytes_of] = values[changed].astype(dtype).view(np.uint8).reshape(-1, dtype.itemsize)
+    if not edit.changes_layout:
+        yield rows.data
+    elif vertex.has_lists:
+        yield from edit.rows_with_lists(rows.data, _steps(vertex, order), order)
+    else:
+        yield edit.rows(rows, vertex, order).data
 
 
-def _cast(values: Float64, dtype: np.dtype) -> NDArray[Any]:
+def _cast(values: Float64, dtype: np.dtype[Any]) -> NDArray[Any]:
     with np.errstate(over="ignore"):
         return values.astype(dtype)
 
 
-def _spliced_ascii(cloud: PointCloud, source: PlySource, step: int = 4096) -> Iterator[bytes]:
-    """The vertex lines with new coordinates, each as the shortest text that reads back as the same number in the
-    property's own type; a coordinate that did not change keeps its text."""
+def _spliced_ascii(cloud: PointCloud, source: PlySource, edit: ColumnEdit, step: int = 4096) -> Iterator[bytes]:
+    """The vertex lines with new values, each as the shortest text that reads back as the same number in the property's
+    own type; a value that did not change keeps its text."""
     vertex = source.header.vertex
-    fields = _fields(vertex)
-    position = source.vertex_start
+    replaced = _replaced(cloud, edit)
+    names = list(replaced)
+    fields = _fields(vertex, names)
+    text = _lines(source)
     for first in range(0, vertex.count, step):
-        part = cloud.xyz[first : first + step]
-        lines, places = [], []
-        for row in range(len(part)):
-            end = source.data.find(b"\n", position, source.vertex_stop)
-            end = source.vertex_stop if end < 0 else end + 1
-            pieces = _split_keeping_spaces(source.data[position:end])
-            position = end
-            lines.append(pieces)
-            places.append([2 * column + 1 for column in _columns(pieces[1::2], vertex, fields, first + row)])
-        for axis, property in enumerate(_axes(vertex)):
+        part = slice(first, min(first + step, vertex.count))
+        lines = [_split_keeping_spaces(line) for line in islice(text, step)]
+        places = [
+            [2 * column + 1 for column in _columns(pieces[1::2], vertex, names, fields, first + row)]
+            for row, pieces in enumerate(lines)
+        ]
+        for number, property in enumerate(_properties(vertex, names)):
             dtype = np.dtype(TYPES[property.type])
-            values = _cast(part[:, axis], dtype)
-            texts = [pieces[place[axis]] for pieces, place in zip(lines, places, strict=True)]
+            values = _cast(replaced[property.name][part], dtype)
+            texts = [pieces[place[number]] for pieces, place in zip(lines, places, strict=True)]
             old = _cast(np.array(list(map(float, texts))), dtype)
             changed = np.flatnonzero((values != old) & np.isfinite(values))
-            for row, text in zip(changed.tolist(), values[changed].astype(str).tolist(), strict=True):
-                lines[row][places[row][axis]] = text.encode()
+            for row, new in zip(changed.tolist(), values[changed].astype(str).tolist(), strict=True):
+                lines[row][places[row][number]] = new.encode()
+        if edit.changes_layout:
+            lines = edit.lines(lines, vertex, part)
         yield b"".join(piece for pieces in lines for piece in pieces)
 
 
@@ -372,9 +445,12 @@ def _split_keeping_spaces(line: bytes) -> list[bytes]:
 
 
 def _write_new(cloud: PointCloud, file: BinaryIO, comment: str | None) -> None:
-    vertices = np.empty(len(cloud), dtype=[(name, "<f8") for name in AXES])
+    layout = [*((name, "<f8") for name in AXES), *((name, f"<{NEW_TYPE}") for name in cloud.columns)]
+    vertices = np.empty(len(cloud), dtype=layout)
     for axis, name in enumerate(AXES):
         vertices[name] = cloud.xyz[:, axis]
+    for name, values in cloud.columns.items():
+        vertices[name] = _cast(values, np.dtype(NEW_TYPE))
     element = plyfile.PlyElement.describe(vertices, "vertex")
     plyfile.PlyData([element], byte_order="<", comments=[comment] if comment else []).write(file)
 

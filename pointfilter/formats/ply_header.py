@@ -127,9 +127,9 @@ class _Parser:
         keyword, *others = text.split(None, 1)
         rest = others[0] if others else b""
         if keyword == b"comment":
-            self.comments.append(_decoded(rest))
+            self.comments.append(decoded(rest))
         elif keyword == b"obj_info":
-            self.obj_info.append(_decoded(rest))
+            self.obj_info.append(decoded(rest))
         elif keyword == b"format":
             self._format(number, _words(rest))
         elif keyword == b"element":
@@ -137,7 +137,7 @@ class _Parser:
         elif keyword == b"property":
             self._property(number, _words(rest))
         else:
-            raise MalformedFileError(f"line {number}: {shown(_decoded(text))} is no PLY header line")
+            raise MalformedFileError(f"line {number}: {shown(decoded(text))} is no PLY header line")
 
     def _format(self, number: int, words: list[str]) -> None:
         if self.encoding:
@@ -219,7 +219,7 @@ def _check(header: Header, file_size: int, limits: ReadLimits) -> None:
         )
 
 
-def _decoded(text: bytes) -> str:
+def decoded(text: bytes) -> str:
     """Headers come in any encoding: UTF-8 where it is, else Latin-1, which never fails. `raw` keeps the bytes."""
     try:
         return text.decode()
@@ -228,7 +228,7 @@ def _decoded(text: bytes) -> str:
 
 
 def _words(text: bytes) -> list[str]:
-    return [_decoded(word) for word in text.split()]  # of bytes: only ASCII knows which characters are blanks
+    return [decoded(word) for word in text.split()]  # of bytes: only ASCII knows which characters are blanks
 
 
 def shown(text: str) -> str:

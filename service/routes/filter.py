@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from functools import partial
 from typing import Any
 
@@ -11,15 +10,13 @@ from starlette.responses import Response
 
 from service.dependencies import AdmittedFolder, CallerDep, ExchangeDep, HouseDep, Ready
 from service.download import FileDownload, content_disposition, result_headers
-from service.errors import DeadlineError
 from service.intake import ACCEPTED, JOB_CODES, accept, accepted
 from service.ordering import OrderDep
 from service.problems import answers
 from service.records import Outcome
-from service.settings import variable
 from service.tracing import note_work
+from service.turn import WORK_CODES, in_turn
 from service.upload import FILE_BODY, receive_upload
-from service.work import cancelled_on_disconnect, in_worker, is_small
 
 router = APIRouter()
 
@@ -39,17 +36,13 @@ HEADERS = {
 }
 _ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "The filtered file: moved coordinates, everything else as it came",
+        "description": "The filtered file: moved coordinates, columns that were asked for, everything else as it came",
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
         "headers": {name: {"description": text, "schema": {"type": "string"}} for name, text in HEADERS.items()},
     },
     202: ACCEPTED,
-    **answers(
-        *JOB_CODES, "malformed-file", "invalid-input", "unsupported-format", "missing-coordinates", "too-few-points",
-        "degenerate-cloud", "cancelled", "error", "model-error", "provider-unavailable", "deadline-exceeded",
-        "worker-died",
-    ),
-}  # fmt: skip
+    **answers(*JOB_CODES, *WORK_CODES),
+}
 
 
 @router.post(
@@ -77,22 +70,13 @@ async def filter_file(
     if upload.size > house.settings.sync_bytes:
         return accepted(request, await accept(request, house, caller, order, upload))
     target = folder / "output.ply"
-    small = await asyncio.to_thread(is_small, upload.path, house.settings.small_points)
-    try:
-        async with (
-            asyncio.timeout(house.settings.timeout_seconds),
-            cancelled_on_disconnect(request),
-            house.admission.worker(small) as waited,
-        ):
-            house.telemetry.waited(waited)
-            delivery = await in_worker(house.executor, partial(house.crew.carry_out, order, upload.path, target))
-    except TimeoutError:
-        raise DeadlineError(
-            f"the result was not there after {house.settings.timeout_seconds:g} s; the work was stopped",
-            limit=house.settings.timeout_seconds,
-            hint="send it as a job (Prefer: respond-async), which has more time, or send less; whoever runs the "
-            f"service can raise {variable('timeout_seconds')}",
-        ) from None
+    delivery, waited = await in_turn(
+        request,
+        house,
+        upload,
+        partial(house.crew.carry_out, order, upload.path, target),
+        "send it as a job (Prefer: respond-async), which has more time, or send less",
+    )
     house.telemetry.delivered(delivery)
     note_work(delivery)
     exchange.points = delivery.report.points

@@ -21,13 +21,13 @@ from service.settings import Settings
 
 
 class Gate:
-    """Stands in for filter_cloud: requests stay inside until the gate opens or their work is stopped."""
+    """Stands in for filter_cloud, or for look: requests stay inside until the gate opens or their work is stopped."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str = "filter_cloud") -> None:
         self.open = threading.Event()
         self.entered = 0
         self.stopped = 0
-        self._real = service.work.filter_cloud
+        self._real = getattr(service.work, name)
 
     def __call__(self, cloud: PointCloud, engine: Any, *, cancelled: Callable[[], bool], **others: Any) -> Any:
         self.entered += 1

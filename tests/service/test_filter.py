@@ -61,6 +61,10 @@ def test_curls_default_content_type_is_a_raw_body(client: TestClient, ply: bytes
         ("strength=0.5", {"strength": 0.5}),
         ("max_move=0.01", {"max_move": 0.01}),
         ("paper=true", {"paper": True}),
+        ("normals=keep", {"normals": "keep"}),
+        ("normals=drop", {"normals": "drop"}),
+        ("columns=displacement,outlier", {"columns": ("displacement", "outlier")}),
+        ("columns=", {"columns": ()}),
         ("radius=20%25", {"radius": Radius(0.2, relative=True)}),
         ("radius=20%", {"radius": Radius(0.2, relative=True)}),
         ("radius=0.3", {"radius": Radius(0.3, relative=False)}),
@@ -114,6 +118,16 @@ def test_the_papers_mode_of_an_adaptive_network(
     assert (answer.headers["x-iterations"], answer.headers["x-moved"]) == ("2", str(report.moved))
     assert answer.headers.get("x-expected-error") is None
     assert answer.content != client.post(f"/filter?model={DEFAULT_MODEL}", content=ply).content
+
+
+def test_normals_are_written(client: TestClient, ply: bytes, tmp_path: Path) -> None:
+    answer = client.post(f"/filter?model={DEFAULT_MODEL}&normals=recompute", content=ply)
+    assert answer.status_code == 200, answer.text
+    (tmp_path / "answer.ply").write_bytes(answer.content)
+    normals = PointCloud.read(tmp_path / "answer.ply").column_values(("nx", "ny", "nz"))
+    answered = normals.any(axis=1)
+    assert answered.sum() >= int(answer.headers["x-moved"]) > 0
+    np.testing.assert_allclose(np.linalg.norm(normals[answered], axis=1), 1, atol=1e-6)
 
 
 @pytest.mark.parametrize("model", ["tiny", DEFAULT_MODEL])

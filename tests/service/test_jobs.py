@@ -44,7 +44,7 @@ def ended(client: TestClient, location: str) -> dict[str, Any]:
 
 
 def test_a_job_gives_what_a_request_gives(client: TestClient, ply: bytes, data_dir: Path) -> None:
-    query = "?iterations=2&radius=20%25&seed=5&strength=0.75&max_move=0.02"
+    query = "?iterations=2&radius=20%25&seed=5&strength=0.75&max_move=0.02&normals=drop&columns=displacement"
     direct = client.post(f"/filter{query}", files={"file": ("scan.ply", ply)})
     answer = client.post(f"/jobs{query}", files={"file": ("scan.ply", ply)})
     location = answer.headers["location"]

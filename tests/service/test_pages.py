@@ -91,6 +91,7 @@ def test_openapi_describes_both_ways_to_send_a_file(client: TestClient) -> None:
     assert set(operation["requestBody"]["content"]) == {"multipart/form-data", "application/octet-stream"}
     assert {parameter["name"] for parameter in operation["parameters"]} == {
         "model", "iterations", "radius", "seed", "format", "strength", "max_move", "paper",
+        "normals", "columns",
     }  # fmt: skip
     assert set(operation["responses"]["200"]["headers"]) == {
         "Content-Disposition", "Server-Timing", "X-Request-ID", "X-Model", "X-Points", "X-Iterations", "X-Moved",

@@ -79,7 +79,7 @@ def test_every_documented_error_is_a_problem_and_every_route_documents_some(clie
                 assert "Retry-After" in answer["headers"]
         seen.append(path)
     assert set(seen) == {
-        "/filter", "/jobs", "/jobs/{id}", "/jobs/{id}/events", "/jobs/{id}/result", "/health", "/health/live",
+        "/filter", "/look", "/jobs", "/jobs/{id}", "/jobs/{id}/events", "/jobs/{id}/result", "/health", "/health/live",
         "/health/ready", "/health/startup", "/models", "/models/{name}",
         "/version", "/metrics", "/", "/problems/{code}",
     }  # fmt: skip

@@ -77,6 +77,25 @@ def test_strength_and_longest_move_reach_the_filter(noisy_file: Path, tmp_path: 
     assert largest("--max-move", full / 3) == pytest.approx(full / 3)
 
 
+def test_normals_reach_the_filter(noisy_file: Path, tmp_path: Path, capsys: Capture) -> None:
+    options = ("--quiet", "--model", models.BUNDLES / ADAPTIVE, "--normals")
+    for normals, found in (("keep", []), ("recompute", ["nx", "ny", "nz"]), ("drop", [])):
+        assert run("filter", noisy_file, tmp_path / "a.ply", *options, normals) == 0
+        assert list(PointCloud.read(tmp_path / "a.ply").column_types)[4:] == found
+    assert "adaptive model" in refused(capsys, 2, "filter", noisy_file, tmp_path / "b.ply", "--normals", "recompute")
+
+
+def test_columns_reach_the_filter(noisy_file: Path, tmp_path: Path, capsys: Capture) -> None:
+    assert run("filter", noisy_file, tmp_path / "a.ply", "--json", "--columns", "outlier,displacement") == 0
+    report = json.loads(capsys.readouterr().out)
+    cloud = PointCloud.read(tmp_path / "a.ply")
+    assert list(cloud.column_types)[4:] == ["scalar_displacement", "scalar_outlier"]
+    assert cloud.column_values(["scalar_displacement"]).max() == pytest.approx(report["largest_displacement"])
+    assert "got 'colour'" in refused(capsys, 2, "filter", noisy_file, tmp_path / "b.ply", "--columns", "colour")
+    again = refused(capsys, 2, "filter", tmp_path / "a.ply", tmp_path / "b.ply", "--columns", "outlier")
+    assert "scalar_outlier" in again
+
+
 def test_the_paper_s_mode_of_an_adaptive_bundle(noisy_file: Path, tmp_path: Path, capsys: Capture) -> None:
     reports = []
     for options in ([], ["--paper"]):
@@ -294,12 +313,26 @@ def test_info(noisy_file: Path, capsys: Capture) -> None:
     assert "600 × float x, float y, float z, uchar mark" in text
 
 
+def test_info_says_how_noisy_a_file_is(noisy_file: Path, capsys: Capture) -> None:
+    assert run("info", noisy_file, "--json", "--model", models.BUNDLES / ADAPTIVE, "--threads", 1) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["verdict"], found["warnings"]) == ("noisy", [])
+    assert 0.002 < found["noise"] < 0.02
+    assert found["encoding"] == "binary_little_endian"
+    assert run("info", noisy_file) == 0  # the default model tells no errors here
+    assert "cannot tell" in capsys.readouterr().out
+    assert run("info", noisy_file, "--brief", "--json", "--model", "grand") == 0
+    assert "verdict" not in json.loads(capsys.readouterr().out)
+    assert "known: tiny" in refused(capsys, 4, "info", noisy_file, "--model", "grand")
+
+
 @pytest.mark.parametrize("rows", [[], [(float("nan"), 0.0, 0.0)]])
 def test_info_of_a_cloud_that_is_nowhere(rows: list[tuple[float, ...]], tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "a.ply").write_bytes(ply_bytes("ascii", rows))
     assert run("info", tmp_path / "a.ply", "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["low"], found["high"], found["diagonal"]) == (None, None, 0)
+    assert (found["verdict"], len(found["warnings"])) == ("cannot tell", 1)
     assert run("info", tmp_path / "a.ply") == 0
 
 

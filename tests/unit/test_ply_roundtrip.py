@@ -197,6 +197,27 @@ def test_only_x_y_z_and_our_comment_differ(sample: Sample, seed: int) -> None:
     assert after[new:] == before.data[old:]
 
 
+@settings(max_examples=200)
+@given(sample=ply_files())
+def test_a_column_that_is_added_and_dropped_leaves_the_same_file(sample: Sample) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        source, more, back, less = (Path(folder, f"{name}.ply") for name in ("in", "more", "back", "less"))
+        source.write_bytes(sample.written.data)
+        cloud = PointCloud.read(source)
+        values = np.arange(len(cloud)) / 8
+        cloud.with_columns({"scalar_of_ours": values}).write(more)
+        added = PointCloud.read(more)
+        np.testing.assert_array_equal(added.xyz, cloud.xyz)
+        np.testing.assert_array_equal(added.column_values(["scalar_of_ours"])[:, 0], values)
+        added.without_columns(["scalar_of_ours"]).write(back)
+        assert back.read_bytes() == sample.written.data
+        others = [name for name in cloud.column_types if name not in AXES]
+        cloud.without_columns(others[:2]).write(less)
+        left = PointCloud.read(less)
+        np.testing.assert_array_equal(left.xyz, cloud.xyz)
+        assert list(left.column_types) == [name for name in cloud.column_types if name not in others[:2]]
+
+
 @settings(max_examples=100)
 @given(sample=ply_files())
 def test_the_summary_says_what_is_in_the_file(sample: Sample) -> None:

@@ -11,6 +11,7 @@ def test_the_public_names_are_these() -> None:
     assert pointfilter.__all__ == [
         "Engine",
         "Filtered",
+        "Look",
         "ModelBundle",
         "PointCloud",
         "PointfilterError",
@@ -23,6 +24,7 @@ def test_the_public_names_are_these() -> None:
         "filter_points",
         "find_model",
         "load_bundle",
+        "look",
     ]
     assert all(hasattr(pointfilter, name) for name in pointfilter.__all__)
 
