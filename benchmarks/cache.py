@@ -35,17 +35,17 @@ class Cache:
         points = np.ascontiguousarray(points, np.float64)
         path = self.folder / f"{_key(settings, points)}.npz"
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
                 return stored["points"], float(stored["seconds"])
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):  # absent or cut short
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):  # absent or cut short
             pass
         started = time.perf_counter()
         smoothed = settings(points)
         seconds = time.perf_counter() - started
         self.folder.mkdir(parents=True, exist_ok=True)
         partial = path.with_suffix(f".{os.getpid()}.partial")
-        with partial.open("wb") as file:
-            np.savez(file, points=smoothed, seconds=seconds)
+        with partial.open("wb") as output:
+            np.savez(output, points=smoothed, seconds=seconds)
         partial.replace(path)
         return smoothed, seconds
 

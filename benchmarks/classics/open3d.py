@@ -38,7 +38,7 @@ class Open3dMls:
 class Open3dBilateral:
     """`PointCloud.smooth_bilateral`: the mean of the neighbours, weighted by distance and by height over the plane.
 
-    The neighbours are the nearest `neighbours` points inside `radius`. Open3D estimates the normals that it needs.
+    The neighbours are the nearest `neighbours` points inside `radius`; the normals are PCA's over the same ones.
     """
 
     radius: float
@@ -55,7 +55,7 @@ class Open3dBilateral:
         cloud = _cloud(points, open3d)
         search = open3d.geometry.KDTreeSearchParamHybrid(self.radius, self.neighbours)
         for _ in range(self.iterations):
-            cloud.normals = open3d.utility.Vector3dVector()  # estimated anew, at the points as they are now
+            cloud.estimate_normals(search)
             cloud = cloud.smooth_bilateral(search, self.spatial_sigma, self.range_sigma)
         return np.array(cloud.points, np.float64)
 
