@@ -41,7 +41,7 @@ def default_methods(table: list[Row]) -> list[str]:
 def wins_table(table: list[Row], columns: Iterable[str]) -> str:
     """Per bundle: in how many cells its P2F is below and above each other row's, and where it compares worst."""
     cells = p2f_by_cell(table, columns)
-    lines = [f"{'P2F by cell':28}{'against':28}{'wins':>6}{'losses':>8}{'worst ratio':>13}  cell"]
+    lines = [f"{'P2F by cell':34}{'against':34}{'wins':>6}{'losses':>8}{'worst ratio':>13}  cell"]
     for ours in default_methods(table):
         own = {cell: scores for cell, scores in cells.items() if ours in scores}
         for other in dict.fromkeys(name for scores in own.values() for name in scores if name != ours):
@@ -65,7 +65,7 @@ def _wins_line(ours: str, other: str, ratios: dict[Cell, float]) -> str:
     wins = sum(ratio < 1 for ratio in ratios.values())
     losses = sum(ratio > 1 for ratio in ratios.values())
     worst = max(ratios, key=ratios.__getitem__)
-    return f"{ours:28}{other:28}{wins:6d}{losses:8d}{ratios[worst]:13.3f}  {worst[1]}, {worst[0]}"
+    return f"{ours:34}{other:34}{wins:6d}{losses:8d}{ratios[worst]:13.3f}  {worst[1]}, {worst[0]}"
 
 
 def error_groups(expected: Float64, real: Float64) -> Row:

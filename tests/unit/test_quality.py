@@ -279,8 +279,12 @@ def test_sets_points_and_scenes_may_be_chosen(monkeypatch: pytest.MonkeyPatch) -
     assert chosen("--columns", "printed") == ({"printed"}, [])
     assert chosen("--points", "5000") == ({"meshes", "shapes"}, [])
     assert chosen("--points", "5000", "--set", "meshes") == ({"meshes"}, [])
+    assert chosen("--points", "5000", "--columns", "shapes 5 k 1 %") == ({"shapes"}, [])
     with pytest.raises(SystemExit):
         chosen("--points", "1000000")
+    for unknown in (["--columns", "shapes 5 k 1 %"], ["--points", "5000", "--columns", "shapes 1 %"]):
+        with pytest.raises(SystemExit):
+            quality.main(unknown)
 
 
 def test_scenes_are_measured_once_and_printed(
