@@ -27,7 +27,8 @@ Filter = Wlop | BilateralSmoothing | JetSmoothing | Open3dMls | Open3dBilateral 
 
 # Chosen for the least geometric mean of CD and P2F, relative to the noisy cloud's. 10 000 points: on fandisk and
 # Tetrahedron, with `--tune` or from a grid by hand. 100 000 points: from a handful of candidates each, most of them
-# tried on fandisk alone; at 1.5 % and 2.5 % WLOP, MLS and RIMLS are the least searched.
+# tried on fandisk alone; at 1.5 % and 2.5 % WLOP, MLS and RIMLS are the least searched. Open3D: from a handful of
+# candidates each on fandisk; with 100 000 points at 1.5 % and 2.5 % carried on from 1 %, not searched.
 SETTINGS: dict[str, dict[tuple[float, int], Filter]] = {
     "CGAL WLOP": {
         (0.005, 100_000): Wlop(0.02, 10),
@@ -55,19 +56,21 @@ SETTINGS: dict[str, dict[tuple[float, int], Filter]] = {
     },
     "Open3D MLS": {
         (0.005, 100_000): Open3dMls(0.015, 100, 2),
-        (0.01, 100_000): Open3dMls(0.03, 250, 3),
-        (0.015, 100_000): Open3dMls(0.04, 400, 3),
-        (0.025, 100_000): Open3dMls(0.06, 800, 3),
+        (0.01, 100_000): Open3dMls(0.025, 250, 2),
+        (0.015, 100_000): Open3dMls(0.035, 500, 2),
+        (0.025, 100_000): Open3dMls(0.06, 1000, 2),
         (0.005, 10_000): Open3dMls(0.03, 20, 1),
         (0.01, 10_000): Open3dMls(0.05, 25, 2),
+        (0.02, 10_000): Open3dMls(0.08, 40, 2),
     },
     "Open3D bilateral": {
         (0.005, 100_000): Open3dBilateral(0.015, 100, 0.01, 0.01, 2),
-        (0.01, 100_000): Open3dBilateral(0.03, 250, 0.015, 0.02, 3),
-        (0.015, 100_000): Open3dBilateral(0.04, 400, 0.02, 0.03, 3),
-        (0.025, 100_000): Open3dBilateral(0.06, 800, 0.03, 0.05, 3),
+        (0.01, 100_000): Open3dBilateral(0.025, 250, 0.015, 0.02, 2),
+        (0.015, 100_000): Open3dBilateral(0.035, 500, 0.02, 0.03, 2),
+        (0.025, 100_000): Open3dBilateral(0.06, 1000, 0.04, 0.05, 2),
         (0.005, 10_000): Open3dBilateral(0.03, 20, 0.02, 0.02, 1),
         (0.01, 10_000): Open3dBilateral(0.05, 40, 0.025, 0.03, 1),
+        (0.02, 10_000): Open3dBilateral(0.08, 60, 0.04, 0.06, 2),
     },
     "MLS (PCL's method)": {
         (0.005, 100_000): MovingLeastSquares(0.022, 0.022, 1),
