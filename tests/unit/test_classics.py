@@ -24,7 +24,7 @@ from benchmarks.classics.tuning import variations
 
 OURS: list[Filter] = [MovingLeastSquares(0.08, 0.08, 1), Rimls(0.06, 0.05, 0.5, 1, 0.8, 1)]
 CGAL: list[Filter] = [Wlop(0.06, 4), BilateralSmoothing(40, 40, 30.0, 2), JetSmoothing(40, 1)]
-OPEN3D: list[Filter] = [Open3dMls(0.08, 100, 1), Open3dBilateral(0.08, 100, 0.04, 0.04, 2)]
+OPEN3D: list[Filter] = [Open3dMls(0.05, 40, 1), Open3dBilateral(0.05, 40, 0.025, 0.03, 1)]
 
 
 def named(method: object) -> str:
