@@ -5,7 +5,7 @@ Four sets, each in a folder of its own:
 paper     paper4/: NAME.npy (clean), NAME_0.005.npy (noisy, row for row) and mesh/*.ply (surfaces; the one that fits a
           cloud is found by distance)
 meshes    meshes/*.ply, sampled
-shapes    shapes/*.ply, sampled more densely
+shapes    shapes/*.ply, sampled
 printed   printed/: NAME_scan.ply, a real scan, and NAME_truth.ply, the mesh that was scanned, in the same place
 
 A noisy cloud that is not on disk is made from the clean one with a seed of its own, the same in every run.
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -38,10 +38,12 @@ EDGE_REACH = 0.01  # of the diagonal: a point counts for `edge` when the clean p
 EDGE_SPACING = 0.0005  # of the diagonal: how densely sharp edges are sampled to find them
 THINNEST = 0.1  # of the density of the dense side, on the thin side of an uneven cloud
 
-MESH_POINTS = 200_000  # of the clean cloud of a mesh
+MESH_POINTS = 400_000  # of the clean cloud of a mesh
 SHAPE_POINTS = 400_000
+PRINTED_POINTS = 200_000  # of the surface that was scanned
 
 Set = Literal["paper", "meshes", "shapes", "printed"]
+SAMPLED: tuple[Set, ...] = ("meshes", "shapes")  # meshes that any number of points is drawn from
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,17 @@ class Column:
     """Of these clouds; none: of all in the set."""
 
 
+def _sampled(subjects: Set, levels: Iterable[float], points: int) -> list[Column]:
+    """Columns of a set of meshes with Gaussian noise; the number of points is in the name unless it is 100 000."""
+    density = "" if points == 100_000 else f" {points / 1000:g} k"
+    return [
+        Column(
+            f"{subjects}{density} {f'{100 * level:g} %' if level else 'clean'}", level, points=points, subjects=subjects
+        )
+        for level in levels
+    ]
+
+
 COLUMNS = (
     Column("clean", 0.0),
     Column("0.25 %", 0.0025),
@@ -73,15 +86,25 @@ COLUMNS = (
     Column("30 k", 0.005, points=30_000),
     Column("50 k", 0.005, points=50_000),
     Column("uneven", 0.005, uneven=True),
-    Column("meshes 10 k 1 %", 0.01, points=10_000, subjects="meshes"),
-    Column("shapes clean", 0.0, points=100_000, subjects="shapes"),
-    Column("shapes 0.5 %", 0.005, points=100_000, subjects="shapes"),
-    Column("shapes 1 %", 0.01, points=100_000, subjects="shapes"),
-    Column("shapes 2.5 %", 0.025, points=100_000, subjects="shapes"),
-    Column("shapes 10 k 1 %", 0.01, points=10_000, subjects="shapes"),
+    *_sampled("meshes", (0.0, 0.0025, 0.005, 0.01, 0.025), 100_000),
+    *_sampled("meshes", (0.005, 0.01, 0.02), 10_000),
+    *_sampled("shapes", (0.0, 0.0025, 0.005, 0.01, 0.025), 100_000),
+    *_sampled("shapes", (0.005, 0.01, 0.02), 10_000),
     Column("shapes 400 k 0.5 %", 0.005, subjects="shapes", only=("busted", "screwdriver", "lion", "springer")),
+    Column("shapes impulsive 0.5 %", 0.005, kind="impulsive", points=100_000, subjects="shapes"),
+    Column("shapes outliers 0.5 %", 0.005, kind="outliers", points=100_000, subjects="shapes"),
+    Column("shapes uneven", 0.005, points=100_000, uneven=True, subjects="shapes"),
     Column("printed", 0.001, subjects="printed"),  # the level is for the classics: the noise is the scanner's
 )
+
+
+def at_points(columns: Iterable[Column], points: int) -> list[Column]:
+    """The columns of meshes with Gaussian noise, once a level, with other points; named as those in COLUMNS are."""
+    levels: dict[Set, list[float]] = {}
+    for column in columns:
+        if column.subjects in SAMPLED and column.kind == "gaussian" and not column.uneven and not column.only:
+            levels.setdefault(column.subjects, []).append(column.level)
+    return [column for name, found in levels.items() for column in _sampled(name, sorted(set(found)), points)]
 
 
 @dataclass(frozen=True)
@@ -132,13 +155,20 @@ class Subject:
             clean = clean[np.sort(rng.choice(len(clean), min(column.points, len(clean)), replace=False))]
         return clean, add_noise(clean, column.level, rng, column.kind) if column.level else clean.copy()
 
-    def scores(self, clean: Float64, points: Float64) -> dict[str, float]:
+    def distances(self, clean: Float64, points: Float64) -> Float64:
+        """Distances (n,) of the points to the surface, for a diagonal of 1 of the clean cloud of the column."""
+        _, points, vertices = normalised(clean, points, self.vertices)
+        return point_to_surface(points, vertices, self.faces)
+
+    def scores(self, clean: Float64, points: Float64, distances: Float64 | None = None) -> dict[str, float]:
         """CD ×1e5, P2F ×1e3 and `edge`, the P2F ×1e3 of the points close to a sharp edge, all for a diagonal of 1.
 
-        clean: the clean cloud of the column. edge is NaN where the surface has no sharp edge.
+        clean: the clean cloud of the column. distances: of the points to the surface, where they are known. edge is NaN
+        where the surface has no sharp edge.
         """
-        clean, points, vertices, edges = normalised(clean, points, self.vertices, self.sharp_edges)
-        distances = point_to_surface(points, vertices, self.faces)
+        if distances is None:
+            distances = self.distances(clean, points)
+        clean, points, edges = normalised(clean, points, self.sharp_edges)
         close = np.zeros(len(points), dtype=bool)
         if len(edges):
             to_edge, _ = cKDTree(edges).query(clean, distance_upper_bound=EDGE_REACH, workers=-1)
@@ -181,7 +211,7 @@ def load_printed(folder: Path) -> list[Subject]:
     subjects = []
     for path in sorted(folder.glob("*_scan.ply")):
         name = path.stem.removesuffix("_scan")
-        truth = sample_mesh(name, *read_mesh(folder / f"{name}_truth.ply"), MESH_POINTS)
+        truth = sample_mesh(name, *read_mesh(folder / f"{name}_truth.ply"), PRINTED_POINTS)
         subjects.append(replace(truth, scan=PointCloud.read(path).xyz))
     return subjects
 

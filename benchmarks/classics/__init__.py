@@ -2,9 +2,9 @@
 
     python -m benchmarks.classics --data DIR --tune RIMLS --noise 0.005     # an entry of SETTINGS and what is around it
 
-WLOP, bilateral smoothing and jet smoothing are CGAL's (`cgal`), MLS and RIMLS are written here (`mls`). Each method is
-a small frozen dataclass of its settings, called with (n, 3) float64 points. Lengths are fractions of the bounding-box
-diagonal; `neighbours` counts points, where CGAL wants counts.
+WLOP, bilateral smoothing and jet smoothing are CGAL's (`cgal`), two more are Open3D's (`open3d`), MLS and RIMLS are
+written here (`mls`). Each method is a small frozen dataclass of its settings, called with (n, 3) float64 points.
+Lengths are fractions of the bounding-box diagonal; `neighbours` counts points, where the library wants counts.
 
 The settings are told the noise level and were tuned (`tuning`) on clouds that the benchmark measures on: an advantage
 that these methods have over a network, on purpose.
@@ -14,18 +14,21 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from importlib.metadata import packages_distributions, version
 
 import numpy as np
 
 from benchmarks.classics.cgal import BilateralSmoothing, JetSmoothing, Wlop
 from benchmarks.classics.mls import MovingLeastSquares, Rimls
+from benchmarks.classics.open3d import Open3dBilateral, Open3dMls
 from benchmarks.classics.unit import Float64
 
-Filter = Wlop | BilateralSmoothing | JetSmoothing | MovingLeastSquares | Rimls
+Filter = Wlop | BilateralSmoothing | JetSmoothing | Open3dMls | Open3dBilateral | MovingLeastSquares | Rimls
 
 # Chosen for the least geometric mean of CD and P2F, relative to the noisy cloud's. 10 000 points: on fandisk and
 # Tetrahedron, with `--tune` or from a grid by hand. 100 000 points: from a handful of candidates each, most of them
-# tried on fandisk alone; at 1.5 % and 2.5 % WLOP, MLS and RIMLS are the least searched.
+# tried on fandisk alone; at 1.5 % and 2.5 % WLOP, MLS and RIMLS are the least searched. Open3D: from a handful of
+# candidates each on fandisk; with 100 000 points at 1.5 % and 2.5 % carried on from 1 %, not searched.
 SETTINGS: dict[str, dict[tuple[float, int], Filter]] = {
     "CGAL WLOP": {
         (0.005, 100_000): Wlop(0.02, 10),
@@ -51,6 +54,24 @@ SETTINGS: dict[str, dict[tuple[float, int], Filter]] = {
         (0.005, 10_000): JetSmoothing(25, 3),
         (0.01, 10_000): JetSmoothing(24, 6),
     },
+    "Open3D MLS": {
+        (0.005, 100_000): Open3dMls(0.015, 100, 2),
+        (0.01, 100_000): Open3dMls(0.025, 250, 2),
+        (0.015, 100_000): Open3dMls(0.035, 500, 2),
+        (0.025, 100_000): Open3dMls(0.06, 1000, 2),
+        (0.005, 10_000): Open3dMls(0.03, 20, 1),
+        (0.01, 10_000): Open3dMls(0.05, 25, 2),
+        (0.02, 10_000): Open3dMls(0.08, 40, 2),
+    },
+    "Open3D bilateral": {
+        (0.005, 100_000): Open3dBilateral(0.015, 100, 0.01, 0.01, 2),
+        (0.01, 100_000): Open3dBilateral(0.025, 250, 0.015, 0.02, 2),
+        (0.015, 100_000): Open3dBilateral(0.035, 500, 0.02, 0.03, 2),
+        (0.025, 100_000): Open3dBilateral(0.06, 1000, 0.04, 0.05, 2),
+        (0.005, 10_000): Open3dBilateral(0.03, 20, 0.02, 0.02, 1),
+        (0.01, 10_000): Open3dBilateral(0.05, 40, 0.025, 0.03, 1),
+        (0.02, 10_000): Open3dBilateral(0.08, 60, 0.04, 0.06, 2),
+    },
     "MLS (PCL's method)": {
         (0.005, 100_000): MovingLeastSquares(0.022, 0.022, 1),
         (0.01, 100_000): MovingLeastSquares(0.028, 0.028, 1),
@@ -73,8 +94,21 @@ SETTINGS: dict[str, dict[tuple[float, int], Filter]] = {
 
 def available() -> dict[str, str]:
     """Every method's name -> why it is missing here, or an empty string."""
-    missing = "" if importlib.util.find_spec("CGAL") else "pip install cgal"
-    return {method: missing if method.startswith("CGAL ") else "" for method in SETTINGS}
+    missing = {
+        "CGAL": "" if importlib.util.find_spec("CGAL") else "pip install cgal",
+        "Open3D": _open3d_missing(),
+    }
+    return {method: missing.get(method.partition(" ")[0], "") for method in SETTINGS}
+
+
+def _open3d_missing() -> str:
+    """Why Open3D cannot be used, or an empty string; it is not imported, that takes seconds."""
+    wanted = "pip install 'open3d-cpu>=0.20' (and the system's libusb 1.0)"
+    if importlib.util.find_spec("open3d") is None:
+        return wanted
+    installed = version(packages_distributions()["open3d"][0])
+    major, minor = (int(number) for number in installed.split(".")[:2])
+    return "" if (major, minor) >= (0, 20) else f"{installed} has no smoothing filters: {wanted}"
 
 
 def tuned(method: str, noise: float, points: int) -> Filter:

@@ -11,6 +11,8 @@ from benchmarks.classics import (
     Filter,
     JetSmoothing,
     MovingLeastSquares,
+    Open3dBilateral,
+    Open3dMls,
     Rimls,
     Wlop,
     available,
@@ -22,6 +24,7 @@ from benchmarks.classics.tuning import variations
 
 OURS: list[Filter] = [MovingLeastSquares(0.08, 0.08, 1), Rimls(0.06, 0.05, 0.5, 1, 0.8, 1)]
 CGAL: list[Filter] = [Wlop(0.06, 4), BilateralSmoothing(40, 40, 30.0, 2), JetSmoothing(40, 1)]
+OPEN3D: list[Filter] = [Open3dMls(0.05, 40, 1), Open3dBilateral(0.05, 40, 0.025, 0.03, 1)]
 
 
 def named(method: object) -> str:
@@ -40,10 +43,12 @@ def off_sphere(points: np.ndarray) -> float:
     return float(np.abs(np.linalg.norm(points - [5.0, 6.0, 7.0], axis=1) - 1).mean())
 
 
-@pytest.fixture(params=[*OURS, *CGAL], ids=named)
+@pytest.fixture(params=[*OURS, *CGAL, *OPEN3D], ids=named)
 def method(request: pytest.FixtureRequest) -> Filter:
     if request.param in CGAL:
         pytest.importorskip("CGAL", reason="pip install cgal")
+    if request.param in OPEN3D and available()["Open3D MLS"]:
+        pytest.skip(available()["Open3D MLS"])
     chosen: Filter = request.param
     return chosen
 
@@ -165,7 +170,16 @@ def test_available_names_every_method_and_what_is_missing(monkeypatch: pytest.Mo
     assert set(available()) == set(SETTINGS)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert available()["CGAL WLOP"] == "pip install cgal"
+    assert available()["Open3D MLS"].startswith("pip install 'open3d-cpu>=0.20'")
     assert available()["RIMLS"] == ""
+
+
+@pytest.mark.parametrize(("installed", "usable"), [("0.19.0", False), ("0.20.0", True), ("1.0.0rc1", True)])
+def test_an_older_open3d_is_left_out(installed: str, usable: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
+    monkeypatch.setattr("benchmarks.classics.packages_distributions", lambda: {"open3d": ["open3d-cpu"]})
+    monkeypatch.setattr("benchmarks.classics.version", lambda name: installed)
+    assert (available()["Open3D bilateral"] == "") == usable
 
 
 @pytest.mark.parametrize("name", list(SETTINGS))
@@ -179,7 +193,7 @@ def test_smooth_uses_the_tuned_settings(name: str) -> None:
 
 
 def test_variations_change_one_setting_each() -> None:
-    for settings in (*OURS, *CGAL):
+    for settings in (*OURS, *CGAL, *OPEN3D):
         for other in variations(settings):
             changed = [name for name, value in vars(settings).items() if vars(other)[name] != value]
             assert len(changed) == 1

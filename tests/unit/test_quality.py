@@ -12,9 +12,19 @@ import pytest
 
 pytest.importorskip("trimesh", reason="the benchmarks extra is not installed")
 
-from benchmarks import quality, subjects
+from benchmarks import parts, quality, subjects
 from benchmarks.rates import patch_flops
-from benchmarks.subjects import COLUMNS, Column, Subject, load_clouds, load_meshes, load_printed, load_shapes
+from benchmarks.scenes import SCENES, Part, Scene
+from benchmarks.subjects import (
+    COLUMNS,
+    Column,
+    Subject,
+    at_points,
+    load_clouds,
+    load_meshes,
+    load_printed,
+    load_shapes,
+)
 from pointfilter import Engine, PointCloud, filter_cloud
 from pointfilter.adaptive.calibration import Calibration
 from pointfilter.metrics import point_to_surface
@@ -106,15 +116,22 @@ def test_shapes_are_sampled_more_densely(data: Path) -> None:
     assert (angle.name, lion.name) == ("angle", "lion")
     assert len(angle.clean) == 400_000
     assert (angle.clean != lion.clean).any()
-    columns = {column.name: column for column in COLUMNS if column.subjects == "shapes"}
-    assert {name: len(lion.clouds(column)[1]) for name, column in columns.items()} == {
-        "shapes clean": 100_000,
-        "shapes 0.5 %": 100_000,
-        "shapes 1 %": 100_000,
-        "shapes 2.5 %": 100_000,
-        "shapes 10 k 1 %": 10_000,
-        "shapes 400 k 0.5 %": 400_000,
-    }
+    columns = [column for column in COLUMNS if column.subjects == "shapes"]
+    assert {"shapes clean", "shapes 2.5 %", "shapes 10 k 1 %", "shapes 400 k 0.5 %"} <= {c.name for c in columns}
+    for column in columns:
+        thousands = next((part for part in ("10 k", "400 k") if part in column.name), "100 k")
+        assert len(lion.clouds(column)[1]) == 1000 * int(thousands.removesuffix(" k")), column.name
+
+
+def test_columns_at_another_density_are_named_and_noisy_alike() -> None:
+    columns = {column.name: column for column in COLUMNS}
+    sparse = {column.name: column for column in at_points(COLUMNS, 10_000)}
+    assert sparse["shapes 10 k 1 %"] == columns["shapes 10 k 1 %"]
+    assert sparse["meshes 10 k 2.5 %"].level == 0.025
+    assert {column.points for column in sparse.values()} == {10_000}
+    assert len(sparse) == 12  # six levels of two sets
+    dense = {column.name: column for column in at_points(COLUMNS, 100_000)}
+    assert dense["shapes 1 %"] == columns["shapes 1 %"]
 
 
 def test_a_printed_scan_is_measured_against_what_was_printed(data: Path) -> None:
@@ -172,7 +189,9 @@ def test_it_goes_on_where_it_stopped(
     assert json.loads(table.read_text())["rows"] == second
     printed = capsys.readouterr().out
     assert "mean of 1" in printed
-    assert printed.count("tiny auto") == 4
+    rows, _, comparison = printed.partition("P2F by cell")
+    assert rows.count("tiny auto") == 4
+    assert "impulsive 0.5 %" in comparison
 
 
 def test_other_lengths_of_patch_are_rows_of_their_own(data: Path, bundle_folder: Path, subject: Subject) -> None:
@@ -208,7 +227,8 @@ def test_passes_that_the_filter_does_not_make_leave_the_rows_alike(helping: int,
             errors = np.tile(np.float32([-3, -2] if helps else [-2, -3]), (len(queries), 1))
             return Answers(np.full((len(queries), 3), 0.01, np.float32), errors)
 
-    rows = quality._filtered(noisy, Network())  # type: ignore[arg-type]
+    rows, result = quality._filtered(noisy, Network())  # type: ignore[arg-type]
+    assert result.points is rows["auto"][0]
     made = {"1": 1, "2": 2, "4": 4, "auto": 6}
     most = min(helping + 1, 6) if helping else 0  # one more to see that it does not help
     assert {name: passes for name, (_, _, passes) in rows.items()} == {
@@ -243,5 +263,51 @@ def test_clouds_may_be_named(data: Path, capsys: pytest.CaptureFixture[str], mon
 
 
 def test_without_data_it_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("--data", tmp_path) == 2
-    assert "POINTFILTER_BENCHMARK_DATA" in capsys.readouterr().err
+    assert run("--data", tmp_path, "--set", "shapes") == 2
+    said = capsys.readouterr().err
+    assert "POINTFILTER_BENCHMARK_DATA" in said
+    assert f"left out: the set shapes: no folder shapes/ in {tmp_path}" in said
+
+
+def test_sets_points_and_scenes_may_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    def chosen(*arguments: str) -> tuple[set[str], list[str]]:
+        options = quality._parser().parse_args(list(arguments))
+        return {column.subjects for column in quality._columns(options)}, quality._scenes(options)
+
+    everything = {"paper", "meshes", "shapes", "printed"}
+    assert chosen() == (everything, list(SCENES))
+    assert chosen("--set", "scenes") == (set(), list(SCENES))
+    assert chosen("--set", "scenes", "printed", "--clouds", "room") == ({"printed"}, ["room"])
+    assert chosen("--columns", "printed") == ({"printed"}, [])
+    assert chosen("--points", "5000") == ({"meshes", "shapes"}, [])
+    assert chosen("--points", "5000", "--set", "meshes") == ({"meshes"}, [])
+    assert chosen("--points", "5000", "--columns", "shapes 5 k 1 %") == ({"shapes"}, [])
+    with pytest.raises(SystemExit):
+        chosen("--points", "1000000")
+    for unknown in (["--columns", "shapes 5 k 1 %"], ["--points", "5000", "--columns", "shapes 1 %"]):
+        with pytest.raises(SystemExit):
+            quality.main(unknown)
+
+
+def test_scenes_are_measured_once_and_printed(
+    data: Path, bundle_folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(0)
+    clean = rng.random((300, 3)) * [1, 1, 0]
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
+    flat = Part("flat", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    noisy = clean + rng.normal(scale=0.01, size=clean.shape)
+    monkeypatch.setitem(SCENES, "room", lambda: Scene("room", "mm", (flat,), clean, noisy, np.zeros(300, np.int64)))
+    table = data / "table.json"
+    options = ["--models", bundle_folder, "--classics", "--set", "scenes", "--clouds", "room", "--json", table]
+    assert run(*options) == 0
+    (row,) = json.loads(table.read_text())["scenes"]
+    assert (row["scene"], row["part"], row["method"], row["points"]) == ("room", "flat", "tiny", 300)
+    height = noisy[:, 2] ** 2 + np.square(noisy[:, :2] - np.clip(noisy[:, :2], 0, 1)).sum(axis=1)
+    assert row["before"] == pytest.approx(1000 * np.sqrt(height.mean()))
+    monkeypatch.setattr(parts, "filter_points", None)
+    capsys.readouterr()
+    assert run(*options) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("flat") == 1
+    assert f"{row['after']:.4f}" in printed
