@@ -13,7 +13,7 @@ from pointfilter.adaptive.balls import choose_balls
 from pointfilter.adaptive.calibration import Calibration
 from pointfilter.adaptive.places import PLACEHOLDER_ROWS, distinct_places, neighbourhood_keys
 from pointfilter.errors import InvalidModelError
-from pointfilter.filter import _Means, filter_points, patch_centres, reached
+from pointfilter.filter import ANSWERS, _Means, filter_points, patch_centres, reached, thinned
 from pointfilter.grids import Grids
 from pointfilter.network import Answers, Network
 from pointfilter.patches import mixed, sampling_key
@@ -164,7 +164,27 @@ def test_a_point_takes_the_mean_of_what_the_patches_that_reach_it_answer() -> No
     assert near.any(axis=1).all()
     assert near.sum(axis=1).max() > 2
     mean = (near @ points[centres]) / near.sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(result.points, (points + mean) / 2, atol=1e-6)
+    few = near.sum(axis=1) <= ANSWERS
+    assert few.mean() > 0.5
+    np.testing.assert_allclose(result.points[few], (points + mean)[few] / 2, atol=1e-6)
+
+
+def test_a_point_asks_a_few_of_the_patches_that_reach_it_and_always_its_own() -> None:
+    rng = np.random.default_rng(2)
+    keys = rng.integers(2**64, size=1_000, dtype=np.uint64)
+    centres = np.arange(100)
+    rows, sizes = np.tile(np.arange(1_000), 100), np.full(100, 1_000)  # every centre reaches every point
+    nearest = rng.integers(100, size=1_000)
+    left, counts = thinned(rows, centres, sizes, nearest, keys)
+    centre = np.repeat(centres, counts)
+    assert len(left) == counts.sum()
+    assert np.bincount(left).mean() == pytest.approx(ANSWERS + 1, rel=0.05)
+    assert set(zip(range(1_000), nearest.tolist(), strict=True)) <= set(
+        zip(left.tolist(), centre.tolist(), strict=True)
+    )
+    few, same = thinned(rows[:3_000], centres[:3], sizes[:3], nearest % 3, keys)
+    np.testing.assert_array_equal(few, rows[:3_000])
+    np.testing.assert_array_equal(same, sizes[:3])
 
 
 def test_the_order_of_answers_does_not_matter_to_their_mean() -> None:
