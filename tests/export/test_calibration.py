@@ -72,6 +72,7 @@ def test_a_small_network_is_calibrated_the_same_every_time() -> None:
     assert found == Calibration.from_dict(found.as_dict())
     assert (found.balls, found.passes) == (UNCALIBRATED.balls, UNCALIBRATED.passes)
     assert found.preference in module.PREFERENCES
+    assert found.still_weight in module.STILL_WEIGHTS
     assert found.margin in module.MARGINS
     assert found.error_factor not in (0.0, 1.0)
 
@@ -110,4 +111,4 @@ def test_the_error_factor_makes_expected_errors_real_ones(monkeypatch: pytest.Mo
 def test_a_network_that_moves_nothing_has_no_factor(monkeypatch: pytest.MonkeyPatch) -> None:
     found = of(staying, monkeypatch)
     assert found.error_factor == 1
-    assert dataclasses.replace(found, preference=0.05, margin=0.0) == UNCALIBRATED
+    assert dataclasses.replace(found, preference=0.05, still_weight=1.0, margin=0.0) == UNCALIBRATED

@@ -72,7 +72,8 @@ def test_altered_weights_are_noticed(copy: Path) -> None:
 
 
 CALIBRATION = {
-    "balls": [24, 48], "preference": 0.1, "margin": 0.0, "passes": 3, "query_reach": 0.4, "error_factor": 1.2,
+    "balls": [24, 48], "preference": 0.1, "still_weight": 0.5, "margin": 0.0, "passes": 3, "query_reach": 0.4,
+    "error_factor": 1.2,
 }  # fmt: skip
 CHANGES: dict[str, Change] = {
     "another schema": lambda d: d.update(schema=SCHEMA + 1),
