@@ -21,7 +21,8 @@ from pointfilter.models import load_bundle
 from pointfilter.network import Answers
 
 CALIBRATION = {
-    "balls": [24, 48], "preference": 0.1, "margin": 0.0, "passes": 3, "query_reach": 0.4, "error_factor": 1.2,
+    "balls": [24, 48], "preference": 0.1, "still_weight": 0.5, "margin": 0.0, "passes": 3, "query_reach": 0.4,
+    "error_factor": 1.2,
 }  # fmt: skip
 
 
