@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pointfilter import _native
-from pointfilter.network import LENGTH_STEP, _by_length
+from pointfilter.network import LENGTH_STEP, by_length
 from pointfilter.patches import NeighbourIndex, Patches
 from tests.clouds import rotation
 
@@ -124,7 +124,7 @@ def test_the_frame_sees_the_whole_ball_and_not_the_choice() -> None:
 def test_every_patch_is_evaluated_once_at_a_length_that_fits(counts: list[int], longest: int) -> None:
     numbers = np.array(counts, dtype=np.int64)
     seen: list[int] = []
-    for length, positions in _by_length(numbers, longest):
+    for length, positions in by_length(numbers, longest):
         assert length <= longest
         assert (np.minimum(numbers[positions], longest) <= length).all()
         assert (length - numbers[positions] <= LENGTH_STEP).all() or length == longest
