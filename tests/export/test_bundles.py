@@ -37,7 +37,7 @@ def small_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
 def checkpoint(tmp_path: Path) -> Path:
     """What a run leaves behind, before its first step."""
     settings = load_preset("smoke", ["network.encoder=[8, 16]", "network.decoder=[8]", "steps=10"])
-    run = Run(tmp_path / "run", settings, resume=False)
+    run = Run(tmp_path / "run", settings)
     run.save()
     return tmp_path / "run" / "checkpoint.pt"
 
