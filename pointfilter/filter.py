@@ -10,20 +10,19 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from pointfilter.adaptive.balls import choose_balls, has_balls
+from pointfilter.adaptive.balls import has_balls, probe_balls
 from pointfilter.adaptive.calibration import Calibration
 from pointfilter.adaptive.places import distinct_places, neighbourhood_keys
+from pointfilter.adaptive.sharing import Means, Queries
 from pointfilter.errors import DegenerateCloudError, FilteringCancelledError, ParameterError, TooFewPointsError
 from pointfilter.grids import Grids
 from pointfilter.network import MIN_NEIGHBOURS, Network, answers, patches_per_batch
 from pointfilter.noise import bounding_box_centre, bounding_box_diagonal
-from pointfilter.patches import SMALLEST_RADIUS, NeighbourIndex, UInt64, mixed, sampling_key
+from pointfilter.patches import SMALLEST_RADIUS, NeighbourIndex, UInt64, sampling_key
 from pointfilter.ranges import numbers_of_ranges, over_ranges
 
 Float64 = NDArray[np.float64]
@@ -34,7 +33,6 @@ DEFAULT_RADIUS = 0.05  # of the bounding-box diagonal, in the paper's mode (§3.
 DEFAULT_ITERATIONS = 2  # in the paper's mode
 MAX_ITERATIONS = 100
 STAGES = ("index", "balls", "patches", "infer")
-ANSWERS = 4  # of patches, that a point takes the mean of: more cost time and change little
 BATCHES_PER_TASK = 8  # batches that a worker cuts in one go, so that workers seldom meet at the interpreter's lock
 
 
@@ -131,9 +129,8 @@ def filter_points(
     elif calibration is not None and has_balls(len(places.points), calibration):
         with clock.measure("balls"):
             key = sampling_key(seed, 0)
-            state.radii[:], gains = choose_balls(
-                places.points, keys, reach, network, calibration, patch_points, key, threads, check
-            )
+            probes = probe_balls(places.points, keys, reach, network, calibration, patch_points, key, threads, check)
+            state.radii[:], _, gains = probes.spread(places.points, threads)
         state.radii[np.isinf(state.radii)] = np.nan  # there is no ball
         state.moving[gains > -calibration.margin] = False  # no ball helps there
     else:
@@ -227,18 +224,13 @@ def _one_pass(
     with clock.measure("index"):
         grids = Grids(before)
         rows = np.flatnonzero(state.moving)
-        owners, reach = rows, 0.0
         if calibration is not None and calibration.query_reach > 0:
-            reach = calibration.query_reach
-            keys = mixed(state.keys ^ np.uint64(key))
-            owners = patch_centres(grids, rows, state.radii, keys, reach, threads, check)
-        centres = np.unique(owners)
-        nearest = np.full(len(before), -1)
-        nearest[rows] = owners
-        asked_rows, sizes = reached(before, rows, centres, state.radii, reach, threads)
-        asked_rows, sizes = thinned(asked_rows, centres, sizes, nearest, state.keys)
+            queries = Queries.shared(grids, rows, state.radii, state.keys, key, calibration.query_reach, threads, check)
+        else:
+            queries = Queries.one_each(rows, len(before))
+        centres, sizes = queries.centres, queries.sizes
         starts = np.cumsum(sizes) - sizes
-    means = _Means(state.radii)
+    means = Means(state.radii)
     done = 0
     for chosen, index in grids.by_radius(centres, state.radii[centres]):
 
@@ -247,13 +239,13 @@ def _one_pass(
             with clock.measure("patches"):
                 patches = index.patches(centres[part], state.radii[centres[part]], patch_points, key)
                 patch, asked = numbers_of_ranges(starts[part], sizes[part])
-                asked = asked_rows[asked]
+                asked = queries.rows[asked]
                 frames, radii = patches.frames[patch], patches.radii[patch][:, None]
                 centre = centres[part][patch]
-                queries = np.einsum("mij,mj->mi", frames, before[asked] - before[centre]) / radii
+                places = np.einsum("mij,mj->mi", frames, before[asked] - before[centre]) / radii
             with clock.measure("infer"):
                 said = answers(
-                    network, patches.points, patches.counts, iteration > 0, queries.astype(np.float32), patch, check
+                    network, patches.points, patches.counts, iteration > 0, places.astype(np.float32), patch, check
                 )
             # r R⁻¹ f(.): R is a rotation, so its inverse is its transpose; the rows of `frames` are the axes.
             steps = np.einsum("mi,mij->mj", said.displacements.astype(np.float64), frames) * radii
@@ -261,7 +253,7 @@ def _one_pass(
             told = patches.counts[patch] >= MIN_NEIGHBOURS
             means.add(asked[told], steps[told], None if log_errors is None else log_errors[told])
             if said.normals is not None:
-                own = centre == nearest[asked]
+                own = centre == queries.own[asked]
                 normals = np.einsum("mi,mij->mj", said.normals[own].astype(np.float64), frames[own])
                 state.normals[asked[own]] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
             return len(asked)
@@ -269,7 +261,7 @@ def _one_pass(
         size = BATCHES_PER_TASK * patches_per_batch(patch_points)
         for answered in over_ranges(evaluate, len(chosen), size, threads, check):
             done += answered
-            report(done * len(rows) // len(asked_rows))
+            report(done * len(rows) // len(queries.rows))
     steps, log_errors = means.of(rows)
     better = np.ones(len(rows), dtype=bool)
     if calibration is not None and log_errors is not None:
@@ -280,85 +272,6 @@ def _one_pass(
     after = before.copy()
     after[rows[better]] += np.nan_to_num(steps[better])
     state.points = after
-
-
-class _Means:
-    """Means of the answers for each of n points: of steps, and of logarithms of errors where there are any.
-
-    Sums are whole numbers of 2⁻⁴⁰ of the point's radius, which float64 adds exactly: their order does not matter.
-    """
-
-    def __init__(self, radii: Float64) -> None:
-        self._units = np.where(np.isfinite(radii), radii, 1.0) * 2.0**-40
-        self._sums = np.zeros((len(radii), 5))
-        self._counts = np.zeros(len(radii), dtype=np.int64)
-        self._log_errors = False
-        self._lock = threading.Lock()
-
-    def add(self, rows: Int64, steps: Float64, log_errors: Float64 | None) -> None:
-        """Takes (m, 3) steps and (m, 2) logarithms of errors, in the unit of the radii, for the points `rows` (m,)."""
-        values = np.zeros((len(rows), 5))
-        values[:, :3] = np.round(steps / self._units[rows, None])
-        if log_errors is not None:
-            values[:, 3:] = np.round(log_errors * 2.0**40)
-        with self._lock:
-            np.add.at(self._sums, rows, values)
-            np.add.at(self._counts, rows, 1)
-            self._log_errors |= log_errors is not None
-
-    def of(self, rows: Int64) -> tuple[Float64, Float64 | None]:
-        """The means (m, 3) and (m, 2); NaN for a point without answers."""
-        with np.errstate(invalid="ignore"):
-            means = self._sums[rows] / self._counts[rows, None]
-        return means[:, :3] * self._units[rows, None], means[:, 3:] * 2.0**-40 if self._log_errors else None
-
-
-def patch_centres(
-    grids: Grids,
-    rows: Int64,
-    radii: Float64,
-    keys: UInt64,
-    reach: float,
-    threads: int,
-    check: Callable[[], None],
-) -> Int64:
-    """For the points `rows` (q,): the row of a point whose patch answers for it, itself or one close by.
-
-    It is the point with the smallest key in a ball of `reach` times the point's own radius; where that lies beyond
-    `reach` of the centre's radius, the point is its own centre.
-    """
-    owners = grids.smallest_key(rows, reach * radii[rows], keys, threads, check)
-    distances = np.linalg.norm(grids.points[rows] - grids.points[owners], axis=1)
-    return np.where(distances <= reach * radii[owners], owners, rows)
-
-
-def reached(
-    points: Float64, rows: Int64, centres: Int64, radii: Float64, reach: float, threads: int
-) -> tuple[Int64, Int64]:
-    """Which of the points `rows` (q,) lie within `reach` of the radius of each of the points `centres` (c,).
-
-    Returns their rows, centre after centre, and how many each centre has: (c,).
-    """
-    tree = cKDTree(points[rows])
-    far = reach * radii[centres]
-    lists = tree.query_ball_point(points[centres], far * (1 + 1e-9), workers=threads)  # which checks boxes of points
-    sizes = np.fromiter(map(len, lists), np.int64, len(lists))
-    found = rows[np.fromiter(chain.from_iterable(lists), np.int64, int(sizes.sum()))]
-    centre = np.repeat(np.arange(len(centres)), sizes)
-    near = np.linalg.norm(points[found] - points[centres[centre]], axis=1) <= far[centre]
-    return found[near], np.bincount(centre[near], minlength=len(centres))
-
-
-def thinned(rows: Int64, centres: Int64, sizes: Int64, nearest: Int64, keys: UInt64) -> tuple[Int64, Int64]:
-    """Leaves about ANSWERS of the patches that each point asks, always the one in `nearest` (n,).
-
-    rows: (m,), the points that the patches around `centres` (c,) answer for, `sizes` (c,) of them each; the same is
-    returned. Whether a pair of point and centre stays depends on their keys (n,) alone.
-    """
-    centre = np.repeat(centres, sizes)
-    wanted = ANSWERS / np.bincount(rows, minlength=len(keys))[rows]
-    stays = (mixed(keys[rows] ^ mixed(keys[centre])) <= wanted * 2.0**64) | (centre == nearest[rows])
-    return rows[stays], np.add.reduceat(stays.astype(np.int64), np.cumsum(sizes) - sizes)
 
 
 def resolve_radius(points: Float64, radius: float | None, fraction: float = DEFAULT_RADIUS) -> float:

@@ -150,10 +150,8 @@ def _balls(places: Float64, engine: Engine, seed: int, check: Callable[[], None]
     probes = probe_balls(
         places, keys, reach, engine, bundle.calibration, bundle.patch_points, key, engine.threads, check
     )
-    near = probes.near(places, engine.threads)
-    radii, sizes = (np.exp(np.log(each)[near].mean(axis=1)) for each in (probes.radii, probes.ball_points))
-    values = np.stack([radii, sizes, probes.gains[near].mean(axis=1)])
-    values[:, np.isinf(radii)] = np.nan
+    values = np.stack(probes.spread(places, engine.threads))
+    values[:, np.isinf(values[0])] = np.nan
     known = probes.errors[np.isfinite(probes.errors)]
     return _Balls(values[0], values[1], values[2], float(np.median(known)) if len(known) else None)
 

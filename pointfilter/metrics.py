@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pointfilter.noise import bounding_box_diagonal
+from pointfilter.noise import bounding_box_centre, bounding_box_diagonal
 
 Float64 = NDArray[np.float64]
 
@@ -21,9 +21,7 @@ PAIRS_AT_ONCE = 1_000_000  # of point and triangle, held in memory
 
 def normalised(clean: Float64, *others: Float64) -> tuple[Float64, ...]:
     """All clouds, (n, 3) each, moved and scaled by the one transformation that gives `clean` a diagonal of 1."""
-    low, high = clean.min(axis=0), clean.max(axis=0)
-    centre = low + (high - low) / 2
-    diagonal = bounding_box_diagonal(clean)
+    centre, diagonal = bounding_box_centre(clean), bounding_box_diagonal(clean)
     return tuple((points - centre) / diagonal for points in (clean, *others))
 
 

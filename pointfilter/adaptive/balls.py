@@ -31,8 +31,8 @@ class Probes:
     """The best ball of each of k probes, points that stand for their neighbourhoods.
 
     points: (k, 3). radii: (k,), inf where there is no ball. ball_points: (k,) int64, points in the ball. gains: (k,),
-    logarithm of the expected error as a share of the error without a filter. errors: (k,), expected distance to the
-    surface without a filter, in the unit of the points; NaN where there is no ball.
+    logarithm of the expected error as a share of the error without a filter, above 0 where the ball does not help.
+    errors: (k,), expected distance to the surface without a filter, in the unit of the points; NaN without a ball.
     """
 
     points: Float64
@@ -41,32 +41,17 @@ class Probes:
     gains: Float64
     errors: Float64
 
-    def near(self, points: Float64, threads: int) -> Int64:
-        """The SPREAD nearest probes of (n, 3) points: (n, at most SPREAD) int64."""
-        return _nearest(self.points, points, SPREAD, threads)
+    def spread(self, points: Float64, threads: int) -> tuple[Float64, Float64, Float64]:
+        """For (n, 3) points radii, ball_points and gains, each (n,) float64: means over the SPREAD nearest probes, of
+        the logarithms for radii and ball_points."""
+        near = _nearest(self.points, points, SPREAD, threads)
+        radii, ball_points = (np.exp(np.log(each)[near].mean(axis=1)) for each in (self.radii, self.ball_points))
+        return radii, ball_points, self.gains[near].mean(axis=1)
 
 
 def has_balls(count: int, calibration: Calibration) -> bool:
     """Whether a cloud of so many distinct points has balls to choose from."""
     return count > max(calibration.balls[0], NEIGHBOURS)
-
-
-def choose_balls(
-    points: Float64,
-    keys: UInt64,
-    reach: Float64,
-    network: Network,
-    calibration: Calibration,
-    patch_points: int,
-    key: int,
-    threads: int,
-    check: Callable[[], None],
-) -> tuple[Float64, Float64]:
-    """The radius (n,) of each point's ball, and the logarithm (n,) of the expected error there as a share of the
-    error without a filter: above 0 where the ball does not help. The arguments are those of probe_balls."""
-    probes = probe_balls(points, keys, reach, network, calibration, patch_points, key, threads, check)
-    near = probes.near(points, threads)
-    return np.exp(np.log(probes.radii)[near].mean(axis=1)), probes.gains[near].mean(axis=1)
 
 
 def probe_balls(
@@ -120,6 +105,7 @@ def probe_balls(
     places = points[probes]
     near = _nearest(places, places, SMOOTHED, threads)
     gains, smooth_still = gains[near].mean(axis=1), still[near].mean(axis=1)
+    # Both are inf where there is no ball, and 0 times that would be NaN.
     wanted = gains if calibration.still_weight == 1 else gains + (1 - calibration.still_weight) * smooth_still
     doublings = np.log2(np.where(np.isfinite(radii), radii, 1.0) / np.maximum(reach[probes], SMALLEST_RADIUS)[:, None])
     wanted = wanted + calibration.preference * doublings

@@ -9,11 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pointfilter.adaptive.balls import choose_balls
+from pointfilter.adaptive.balls import probe_balls
 from pointfilter.adaptive.calibration import Calibration
 from pointfilter.adaptive.places import PLACEHOLDER_ROWS, distinct_places, neighbourhood_keys
+from pointfilter.adaptive.sharing import ANSWERS, Means, patch_centres, reached, thinned
 from pointfilter.errors import InvalidModelError
-from pointfilter.filter import ANSWERS, _Means, filter_points, patch_centres, reached, thinned
+from pointfilter.filter import filter_points
 from pointfilter.grids import Grids
 from pointfilter.network import Answers, Network
 from pointfilter.patches import mixed, sampling_key
@@ -99,7 +100,9 @@ def test_keys_do_not_know_the_pose(seed: int, scale: float) -> None:
 def balls(points: np.ndarray, network: object, **changes: object) -> tuple[np.ndarray, np.ndarray]:
     keys, reach = neighbourhood_keys(points)
     calibration = dataclasses.replace(CALIBRATION, **changes)
-    return choose_balls(points, keys, reach, network, calibration, 50, 1, 2, lambda: None)
+    probes = probe_balls(points, keys, reach, network, calibration, 50, 1, 2, lambda: None)
+    radii, _, gains = probes.spread(points, 2)
+    return radii, gains
 
 
 @pytest.mark.parametrize("best", [24, 48, 96, 192])
@@ -192,7 +195,7 @@ def test_the_order_of_answers_does_not_matter_to_their_mean() -> None:
     rows, steps, logs = rng.integers(20, size=500), rng.normal(size=(500, 3)), rng.normal(size=(500, 2))
     means = []
     for order in (np.arange(500), rng.permutation(500)):
-        means.append(_Means(np.full(30, 0.1)))
+        means.append(Means(np.full(30, 0.1)))
         for part in np.array_split(order, 7):
             means[-1].add(rows[part], steps[part], logs[part])
     every = np.arange(30)
