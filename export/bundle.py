@@ -17,8 +17,9 @@ from export.calibration import calibrate
 from export.checkpoint import Loaded
 from export.graph import OPSET, build, encoder_ranges, graph_network
 from pointfilter.models import FRAME, NAME, NAME_RULE, SCHEMA, ModelBundle, load_bundle
-from training.dataset import Batch, DataSettings, TrainingCloud, cut_batch, training_clouds
+from training.dataset import Batch, DataSettings, TrainingCloud, cut_batch
 from training.own import as_network
+from training.pools import Pools
 
 PARITY_TOLERANCE = 1e-5  # of the radius
 ROUNDING_TOLERANCE = 0.05  # of the mean displacement: what int8 may change of it, on average
@@ -123,7 +124,7 @@ def _calibration_clouds() -> list[TrainingCloud]:
     settings = DataSettings(
         clouds=CALIBRATION_CLOUDS, fewest_points=5_000, most_points=50_000, clean_points=5_000, seed=CALIBRATION_SEED
     )
-    return list(training_clouds(settings))
+    return Pools(settings)(0)
 
 
 def typical_batch(patch_points: int, step: int, patches: int = CALIBRATION_PATCHES) -> Batch:

@@ -69,7 +69,9 @@ def _authors(weights: dict[str, Tensor]) -> Loaded:
     """conv1..5 are 1 × 1 convolutions: linear layers with one axis too many."""
     encoder = _widths(weights, r"encoder\.conv(\d+)\.weight")
     decoder = _widths(weights, r"decoder\.fc(\d+)\.weight")
-    network = Pointfilter(NetworkSettings(tuple(encoder), tuple(decoder[:-1]), norm_after_pool=False, adaptive=False))
+    network = Pointfilter(
+        NetworkSettings(tuple(encoder), tuple(decoder[:-1]), norm_after_pool=False, adaptive=False, mean_pool=False)
+    )
     for number, layer in enumerate(network.encoder, 1):
         _fill(layer, weights, f"encoder.conv{number}")
     for number, norm in enumerate(network.encoder_norms, 1):

@@ -1,13 +1,15 @@
 """The network as an ONNX graph, BatchNorm folded, written node by node: no tracer decides what runs in production.
 
     patches (B, N, 3) -> rows (B·N, 3) -> [Gemm, Relu] ... Gemm -> (B, N, C) -> ReduceMax -> [Mul] Add Relu -> features
+    mean pool:     input of the last Gemm -> (B, N, C') -> MatMul with which rows are points / how many -> features
     the paper's:   features -> [Gemm, Relu] ... Gemm -> Tanh -> displacements (B, 3)
     the adaptive:  features, context (B, 2) -> Concat -> MatMul -> Gather by owners (M,) -> + Gemm of queries (M, 3)
                    -> Relu -> [Gemm, Relu] ... Gemm -> Split -> Tanh -> displacements (M, 3), log_errors (M, 2),
                    normals (M, 3)
 
 The last encoder layer's bias and ReLU come after the max: both are the same for all points and never decreasing, so the
-result is the same and N times less is added and compared.
+result is the same and N times less is added and compared. Centres and padding, whose coordinates are all zero, do not
+count in the mean.
 
 An int8 graph rounds what goes into the encoder's products from the second layer on to 256 levels, and their weights to
 127 levels a channel. It is written with QuantizeLinear and DequantizeLinear, which every provider knows; onnxruntime
@@ -93,12 +95,20 @@ class _Graph:
         return self.node("Gemm", inputs, name)
 
     def _rounded(self, value: str, scale: np.float32, name: str) -> str:
+        """The value in whole steps of the scale; as integers it is NAME_u8."""
         constants = [
             self.constant(f"{name}_scale", np.array(scale)),
             self.constant(f"{name}_zero", np.array(np.uint8(0))),
         ]
         integers = self.node("QuantizeLinear", [value, *constants], f"{name}_u8")
         return self.node("DequantizeLinear", [integers, *constants], name)
+
+    def by_patch(self, rows: str, channels: int, name: str) -> str:
+        """Rows (B·N, C) as (B, N, C): the first two sizes are those of the input."""
+        width = self.constant(f"{name}_channels", np.array([channels], np.int64))
+        return self.node(
+            "Reshape", [rows, self.node("Concat", ["leading_shape", width], f"{name}_shape", axis=0)], name
+        )
 
     def _integers(self, values: NDArray[np.generic], scales: NDArray[np.float32], axis: int, name: str) -> str:
         """Constants that are integers times a scale a channel."""
@@ -137,22 +147,23 @@ def build(network: Pointfilter, ranges: Sequence[float] = ()) -> onnx.ModelProto
         behind = np.where(flipped, scale, 1.0)
     else:
         (matrix, shift), behind = _folded(layer, norm), np.ones(1)
-    rows = product(len(inner), rows, matrix, None)
-    # (B·N, C) -> (B, N, C): the first two sizes are those of the input.
+    last = product(len(inner), rows, matrix, None)
     size = graph.node("Shape", ["patches"], "patches_shape")
-    leading = graph.node(
+    graph.node(
         "Slice",
         [size, graph.constant("zero", np.array([0], np.int64)), graph.constant("two", np.array([2], np.int64))],
         "leading_shape",
     )
-    channels = graph.constant("channels", np.array([matrix.shape[1]], np.int64))
-    shape = graph.node("Concat", [leading, channels], "points_shape", axis=0)
-    points = graph.node("Reshape", [rows, shape], "points")
+    points = graph.by_patch(last, matrix.shape[1], "points")
     features = graph.node("ReduceMax", [points], "pooled", axes=[1], keepdims=0)
     if np.any(behind != 1.0):
         features = graph.node("Mul", [features, graph.constant("pooled_scale", behind.astype(np.float32))], "scaled")
     features = graph.node("Add", [features, graph.constant("pooled_bias", shift.astype(np.float32))], "biased")
-    features = graph.node("Relu", [features], "features")
+    features = graph.node("Relu", [features], "max_features")
+    if network.settings.mean_pool:
+        rounded = ranges[-1] / LEVELS if ranges and inner else None
+        means = _mean(graph, f"encoder{len(inner)}_input_u8" if rounded else rows, len(matrix), rounded)
+        features = graph.node("Concat", [features, means], "features", axis=1)
     inputs, outputs = _ends(network.settings.adaptive)
     for number, (layer, norm) in enumerate(network.decoder_layers()):
         matrix, bias = _folded(layer, norm)
@@ -177,6 +188,28 @@ def build(network: Pointfilter, ranges: Sequence[float] = ()) -> onnx.ModelProto
     )
     onnx.checker.check_model(model, full_check=True)
     return model
+
+
+def _mean(graph: _Graph, rows: str, channels: int, step: float | None) -> str:
+    """The mean (B, C) of rows (B·N, C) over the points of each patch. step: that of rows in integers, whose sum is
+    exact."""
+    one = graph.constant("one_axis", np.array([1], np.int64))
+    coordinates = graph.node("Abs", ["patches"], "magnitudes")
+    coordinates = graph.node("ReduceMax", [coordinates], "magnitude", axes=[2], keepdims=0)
+    present = graph.node("Greater", [coordinates, graph.constant("no_distance", np.array(np.float32(0)))], "present")
+    weights = graph.node("Cast", [present], "present_float", to=TensorProto.FLOAT)
+    number = graph.node("ReduceSum", [weights, one], "present_sum", keepdims=1)
+    number = graph.node("Max", [number, graph.constant("at_least_one", np.array(np.float32(1)))], "present_number")
+    points = graph.by_patch(rows, channels, "mean_points")
+    if step is None:
+        sums = graph.node("MatMul", [graph.node("Unsqueeze", [weights, one], "weights"), points], "mean_sums")
+    else:
+        weights = graph.node("Cast", [present], "present_u8", to=TensorProto.UINT8)
+        weights = graph.node("Unsqueeze", [weights, one], "weights")
+        sums = graph.node("MatMulInteger", [weights, points], "integer_sums")
+        sums = graph.node("Cast", [sums], "float_sums", to=TensorProto.FLOAT)
+        sums = graph.node("Mul", [sums, graph.constant("mean_step", np.array(np.float32(step)))], "mean_sums")
+    return graph.node("Div", [graph.node("Squeeze", [sums, one], "sums"), number], "mean_features")
 
 
 def _ends(adaptive: bool) -> tuple[list[onnx.ValueInfoProto], list[onnx.ValueInfoProto]]:

@@ -25,7 +25,7 @@ from pointfilter.patches import NeighbourIndex
 from training.losses import surface_distances
 from training.network import context
 from training.scanning import scan
-from training.shapes import Mesh, load_meshes, random_shape
+from training.shapes import Mesh, random_shape
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -40,10 +40,10 @@ FALLBACK_BALL = 24  # points, where the ball that was drawn is larger than the c
 
 @dataclass(frozen=True)
 class DataSettings:
-    """What the network is shown."""
+    """What the network is shown: one pool of clouds after another."""
 
-    clouds: int = 320
-    """Training clouds; every one has a shape, a density and a noise level of its own."""
+    clouds: int = 240
+    """Clouds of a pool; every one has a shape, a density and a noise level of its own."""
     fewest_points: int = 2_000
     most_points: int = 200_000
     """Densities are drawn evenly on a logarithmic scale between the two."""
@@ -189,20 +189,6 @@ def load_author_clouds(folder: Path, radius: float) -> list[TrainingCloud]:
     if not clouds:
         raise FileNotFoundError(f"no NAME.npy with NAME_normal.npy in {folder}")
     return clouds
-
-
-def training_clouds(
-    settings: DataSettings, meshes: Path | None = None, clouds: Path | None = None
-) -> Iterator[TrainingCloud]:
-    """The clouds of a run: from the authors' layout, from the user's meshes, or procedural (the default)."""
-    if clouds is not None:
-        yield from load_author_clouds(clouds, settings.radius)
-        return
-    loaded = load_meshes(meshes) if meshes is not None else None
-    for number in range(settings.clouds):
-        seed = settings.seed * 10_000 + number
-        mesh = loaded[number % len(loaded)] if loaded else random_shape(seed)
-        yield cloud_from_mesh(mesh, settings, seed)
 
 
 def validation_cloud(number: int, settings: DataSettings) -> TrainingCloud:

@@ -36,6 +36,9 @@ class NetworkSettings:
     The gradient then reaches one point a channel, and three quarters of the backward pass become a gather."""
     adaptive: bool = True
     """Answer for query points, with expected errors and normals, knowing the points in the ball and the pass."""
+    mean_pool: bool = True
+    """The decoder sees the mean over the patch of what goes into the last encoder layer beside the max of what comes
+    out of it: a max does not average noise. (A sum served PCPNet better than a max: Guerrero et al., 2018.)"""
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> NetworkSettings:
@@ -44,7 +47,13 @@ class NetworkSettings:
             tuple(values["decoder"]),
             bool(values["norm_after_pool"]),
             bool(values.get("adaptive", False)),
+            bool(values.get("mean_pool", False)),
         )
+
+    @property
+    def features(self) -> int:
+        """Width of a patch's feature vector."""
+        return self.encoder[-1] + (([3, *self.encoder])[-2] if self.mean_pool else 0)
 
 
 class Answers(NamedTuple):
@@ -97,7 +106,7 @@ class Pointfilter(nn.Module):
         widths = (3, *settings.encoder)
         self.encoder = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
         self.encoder_norms = nn.ModuleList(nn.BatchNorm1d(width) for width in settings.encoder)
-        widths = (settings.encoder[-1] + (CONTEXT if settings.adaptive else 0), *settings.decoder)
+        widths = (settings.features + (CONTEXT if settings.adaptive else 0), *settings.decoder)
         self.decoder = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
         self.decoder_norms = nn.ModuleList(nn.BatchNorm1d(width) for width in settings.decoder)
         self.head = nn.Linear(widths[-1], ANSWERS if settings.adaptive else 3)
@@ -121,20 +130,25 @@ class Pointfilter(nn.Module):
         *inner, last = self.encoder_layers()
         for layer, norm in inner:
             rows = functional.relu(norm(layer(rows)))
+        lengths = [length * len(group) for length, group in groups]
+        back = torch.argsort(torch.cat([group for _, group in groups]))
+        means = []
+        if self.settings.mean_pool:
+            for part, (length, group) in zip(torch.split(rows, lengths), groups, strict=True):
+                means.append(_mean(part.view(len(group), length, -1), patches[group, :length]))
         layer, norm = last
         if not self.settings.norm_after_pool:
             rows = functional.relu(norm(layer(rows)))
         pooled = []
-        parts = torch.split(rows, [length * len(group) for length, group in groups])
-        for part, (_, group) in zip(parts, groups, strict=True):
+        for part, (_, group) in zip(torch.split(rows, lengths), groups, strict=True):
             if self.settings.norm_after_pool:
                 pooled.append(_PooledLinear.apply(part, layer.weight.to(part.dtype), len(group)))  # type: ignore[no-untyped-call]
             else:
                 pooled.append(part.view(len(group), -1, part.shape[1]).amax(dim=1))
-        features = torch.cat(pooled)[torch.argsort(torch.cat([group for _, group in groups]))]
+        features = torch.cat(pooled)[back]
         if self.settings.norm_after_pool:  # the bias is the same for all points, so it commutes with the max
             features = functional.relu(norm(features.float() + layer.bias))
-        return features
+        return torch.cat([features, torch.cat(means)[back]], dim=1) if means else features
 
     def forward(self, patches: Tensor) -> Tensor:
         """The paper's network: displacements (B, 3) of the centres."""
@@ -168,6 +182,13 @@ class Pointfilter(nn.Module):
         with torch.autocast("cpu", enabled=False):
             values: Tensor = self.head(features.float())
         return values
+
+
+def _mean(rows: Tensor, patches: Tensor) -> Tensor:
+    """The means (B, C) of rows (B, N, C) over the points of patches (B, N, 3), but not over the centres and padding,
+    which are zeros."""
+    present = (patches != 0).any(dim=2)[:, None, :].to(rows.dtype)
+    return torch.bmm(present, rows)[:, 0].float() / present.sum(dim=2).float().clamp_min(1)
 
 
 def context(counts: Tensor, later: Tensor) -> Tensor:

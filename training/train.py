@@ -25,12 +25,12 @@ from training.dataset import (
     clean_patches,
     cut_batch,
     nearest_on_surface,
-    training_clouds,
     validation_cloud,
 )
 from training.losses import LOSSES, LossSettings, adaptive_loss, filtering_loss
 from training.network import NetworkSettings, Pointfilter
 from training.own import own_clouds
+from training.pools import Pools
 
 CHECKPOINT_VERSION = 2
 STABLE = "stable.pt"  # the checkpoint from before the learning rate fell
@@ -48,9 +48,10 @@ class TrainingSettings:
     network: NetworkSettings = field(default_factory=NetworkSettings)
     data: DataSettings = field(default_factory=DataSettings)
     loss: LossSettings = field(default_factory=LossSettings)
-    steps: int = 43_200
-    own_from: tuple[int, ...] = (12_000, 24_000, 36_000, 60_000, 100_000, 150_000)
-    """Steps after which the network filters training clouds anew: later passes see its own outputs."""
+    steps: int = 48_000
+    pool_steps: int = 12_000
+    """Steps with one pool of clouds. From the second pool on the network filters some of them first: later passes see
+    its own outputs."""
     optimizer: str = "adamw"
     """adamw (default) or sgd (the paper's, §3.4)."""
     learning_rate: float = 2e-3
@@ -92,6 +93,8 @@ class TrainingSettings:
         for name, widths in (("encoder", self.network.encoder), ("decoder", self.network.decoder)):
             if not widths:
                 raise ValueError(f"network.{name} must have at least one layer")
+        if self.pool_steps < 1:
+            raise ValueError(f"pool_steps must be at least 1, not {self.pool_steps}")
         if not 0 < self.decay <= 1:
             raise ValueError(f"decay must be above 0 and at most 1, not {self.decay}")
         if not self.network.adaptive and self.data.queries != 1:
@@ -109,7 +112,6 @@ class TrainingSettings:
         values["network"] = NetworkSettings.from_dict(values["network"])
         values["data"] = DataSettings(**data)
         values["loss"] = LossSettings(**values["loss"])
-        values["own_from"] = tuple(values["own_from"])
         return cls(**values)
 
 
@@ -210,20 +212,27 @@ class Run:
             partial.replace(self.folder / "log.csv")
 
     def train(
-        self, clouds: list[TrainingCloud], until: int | None = None, stop: Callable[[], bool] = lambda: False
+        self,
+        pools: Callable[[int], list[TrainingCloud]],
+        until: int | None = None,
+        stop: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Trains to the last step, or stops (with a checkpoint) after step `until` or when stop() says so."""
+        """Trains to the last step, or stops (with a checkpoint) after step `until` or when stop() says so.
+
+        pools: the clouds of a pool by its number, asked for one after another.
+        """
         settings = self.settings
         last = settings.steps if until is None else min(until, settings.steps)
         validation = [validation_cloud(number, settings.data) for number in range(settings.validation_clouds)]
         self.network.train()
         progress = tqdm(initial=self.step, total=settings.steps, unit="batch", smoothing=0.05)
-        own_at = settings.own_from if settings.network.adaptive else ()
         while self.step < last and not stop():
-            started = max((step for step in own_at if step <= self.step), default=None)
-            own = [] if started is None else self._own_clouds(started, clouds)
-            until_own = min([last, *(step for step in own_at if step > self.step)])
-            self._train([*clouds, *own], validation, until_own, progress, stop)
+            pool = self.step // settings.pool_steps
+            if self.step == pool * settings.pool_steps and self.step:
+                self.save()
+            clouds = pools(pool)
+            own = self._own_clouds(pool, clouds) if pool and settings.network.adaptive else []
+            self._train([*clouds, *own], validation, min(last, (pool + 1) * settings.pool_steps), progress, stop)
         progress.close()
         self.save()
 
@@ -289,9 +298,9 @@ class Run:
         loss, left = adaptive_loss(answers, nearest, normals, batch.still, batch.queries, spacing, settings.loss)
         return loss.mean(), left.mean().item()
 
-    def _own_clouds(self, step: int, clouds: list[TrainingCloud]) -> list[TrainingCloud]:
-        """Pieces of the clouds, filtered by the network of this step."""
-        return own_clouds(self.folder / f"own-{step}.npz", clouds, self._trained(), self.settings.data)
+    def _own_clouds(self, pool: int, clouds: list[TrainingCloud]) -> list[TrainingCloud]:
+        """Pieces of the clouds of a pool, filtered by the network of its first step."""
+        return own_clouds(self.folder / f"own-{pool}.npz", clouds, self._trained(), self.settings.data)
 
     def _trained(self) -> Pointfilter:
         """The weights that are exported, not to be trained."""
@@ -391,14 +400,11 @@ def start(
     if meshes or clouds or not resume:
         run.source = {name: str(path.absolute()) for name, path in (("meshes", meshes), ("clouds", clouds)) if path}
     meshes, clouds = (Path(run.source[name]) if name in run.source else None for name in ("meshes", "clouds"))
-    total = None if clouds else settings.data.clouds
-    pool: list[TrainingCloud] = []
-    for cloud in tqdm(training_clouds(settings.data, meshes, clouds), total=total, unit="cloud", desc="clouds"):
-        if stop():
-            raise KeyboardInterrupt
-        pool.append(cloud)
     if init is not None and first is not None:
         record = training_record(init)
         run.start_from(first, [*record.pop("before"), record])
-    run.train(pool, until, stop)
+    last = settings.steps if until is None else min(until, settings.steps)
+    count = -(-last // settings.pool_steps)
+    with Pools(settings.data, count, meshes=meshes, clouds=clouds, stop=stop) as pools:
+        run.train(pools, until, stop)
     return run

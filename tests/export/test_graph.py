@@ -19,13 +19,13 @@ from training.network import NetworkSettings, Pointfilter
 def network(norm_after_pool: bool, seed: int = 0) -> Pointfilter:
     """Random weights, running statistics off their defaults, and BatchNorm scales of both signs and near zero."""
     torch.manual_seed(seed)
-    return _unsettled(Pointfilter(NetworkSettings((16, 24, 40), (24, 12), norm_after_pool, adaptive=False)))
+    return _unsettled(Pointfilter(NetworkSettings((16, 24, 40), (24, 12), norm_after_pool, False, mean_pool=False)))
 
 
-def adaptive(norm_after_pool: bool, seed: int = 0) -> Pointfilter:
+def adaptive(norm_after_pool: bool, seed: int = 0, *, mean_pool: bool = True) -> Pointfilter:
     """The same, answering for queries."""
     torch.manual_seed(seed)
-    return _unsettled(Pointfilter(NetworkSettings((16, 24, 40), (24, 12), norm_after_pool, adaptive=True)))
+    return _unsettled(Pointfilter(NetworkSettings((16, 24, 40), (24, 12), norm_after_pool, True, mean_pool)))
 
 
 def _unsettled(made: Pointfilter) -> Pointfilter:
@@ -49,6 +49,8 @@ def asked(batch: int, length: int, seed: int = 0) -> dict[str, np.ndarray]:
     """Random inputs of an adaptive graph: no query for the first patch, several for the others, in any order."""
     rng = np.random.default_rng(seed)
     patches = rng.uniform(-1, 1, (batch, length, 3)).astype(np.float32)
+    patches[:, 0] = 0
+    patches[batch // 2, 1 + length // 2 :] = 0  # padding
     owners = rng.permutation(np.repeat(np.arange(batch), np.append(0 if batch > 1 else 2, np.full(batch - 1, 3))))
     told = np.stack([rng.uniform(-0.5, 1, batch), rng.integers(2, size=batch)], axis=1).astype(np.float32)
     queries = rng.uniform(-0.45, 0.45, (len(owners), 3)).astype(np.float32)
@@ -61,9 +63,10 @@ def adaptive_answers(model: onnx.ModelProto, given: dict[str, np.ndarray]) -> di
 
 
 @pytest.mark.parametrize("norm_after_pool", [False, True])
+@pytest.mark.parametrize("mean_pool", [False, True])
 @pytest.mark.parametrize("seed", range(3))
-def test_onnxruntime_answers_for_queries_what_torch_answers(norm_after_pool: bool, seed: int) -> None:
-    made = adaptive(norm_after_pool, seed)
+def test_onnxruntime_answers_for_queries_what_torch_answers(norm_after_pool: bool, mean_pool: bool, seed: int) -> None:
+    made = adaptive(norm_after_pool, seed, mean_pool=mean_pool)
     assert (made.encoder_norms[-1].weight < 0).any()
     model = build(made)
     for batch, length in [(1, 1), (2, 7), (64, 33), (3, 700)]:
@@ -99,8 +102,9 @@ def test_an_adaptive_graph_has_the_engine_s_inputs_and_outputs() -> None:
 
 
 @pytest.mark.parametrize("norm_after_pool", [False, True])
-def test_int8_answers_for_queries_nearly_the_same(norm_after_pool: bool) -> None:
-    made = adaptive(norm_after_pool)
+@pytest.mark.parametrize("mean_pool", [False, True])
+def test_int8_answers_for_queries_nearly_the_same(norm_after_pool: bool, mean_pool: bool) -> None:
+    made = adaptive(norm_after_pool, mean_pool=mean_pool)
     given = asked(64, 33)
     model = build(made, encoder_ranges(made, given["patches"]))
     onnx.checker.check_model(model, full_check=True)

@@ -1,10 +1,16 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+
 import pytest
 
-from training.dataset import TrainingCloud, training_clouds
+from training.dataset import TrainingCloud
+from training.pools import Pools
 from training.presets import load_preset
 from training.train import TrainingSettings
+
+MadePools = Callable[[int], list[TrainingCloud]]
 
 TINY = [
     "network.encoder=[8, 16]",
@@ -20,7 +26,7 @@ TINY = [
     "data.largest_ball=200",
     "data.queries=4",
     "data.own_points=300",
-    "own_from=[6]",
+    "pool_steps=6",
     "warmup=2",
     "steps=12",
     "threads=1",
@@ -39,9 +45,16 @@ def tiny() -> TrainingSettings:
 @pytest.fixture(scope="session")
 def tiny_paper() -> TrainingSettings:
     """The same for the paper's network and loss."""
-    return load_preset("smoke", [*TINY, "network.adaptive=false", 'loss.loss="bilateral"', "data.queries=1"])
+    return load_preset(
+        "smoke", [*TINY, "network.adaptive=false", "network.mean_pool=false", 'loss.loss="bilateral"', "data.queries=1"]
+    )
 
 
 @pytest.fixture(scope="session")
-def clouds(tiny: TrainingSettings) -> list[TrainingCloud]:
-    return list(training_clouds(tiny.data))
+def pools(tiny: TrainingSettings) -> MadePools:
+    return cache(Pools(tiny.data))
+
+
+@pytest.fixture(scope="session")
+def clouds(pools: MadePools) -> list[TrainingCloud]:
+    return pools(0)

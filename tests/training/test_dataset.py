@@ -20,10 +20,10 @@ from training.dataset import (
     make_clean,
     make_cloud,
     nearest_on_surface,
-    training_clouds,
     validation_cloud,
 )
 from training.network import context
+from training.pools import Pools
 from training.train import TrainingSettings
 
 
@@ -38,7 +38,7 @@ def test_a_batch_is_a_function_of_settings_and_step(clouds: list[TrainingCloud],
     assert same(first, cut_batch(clouds, tiny.data, 5))
     assert not same(first, cut_batch(clouds, tiny.data, 6))
     assert not same(first, cut_batch(clouds, dataclasses.replace(tiny.data, seed=1), 5))
-    assert same(first, cut_batch(list(training_clouds(tiny.data)), tiny.data, 5))
+    assert same(first, cut_batch(Pools(tiny.data)(0), tiny.data, 5))
 
 
 def test_batches_come_in_order_wherever_one_begins(clouds: list[TrainingCloud], tiny: TrainingSettings) -> None:
@@ -93,7 +93,7 @@ def test_balls_hold_as_many_points_as_a_small_cloud_has(tiny: TrainingSettings) 
 
 def test_a_radius_of_the_settings_is_that_of_every_patch(tiny_paper: TrainingSettings) -> None:
     data = dataclasses.replace(tiny_paper.data, radius=0.07)
-    clouds = list(training_clouds(data))
+    clouds = Pools(data)(0)
     batch = cut_batch(clouds, data, 0)
     for number, radius in zip(batch.clouds, batch.radii, strict=True):
         clean = clouds[number].clean.points
@@ -235,7 +235,7 @@ def test_meshes_of_one_s_own(tmp_path: Path, tiny: TrainingSettings) -> None:
     (tmp_path / "b.obj").write_text(OBJ)
     (tmp_path / "a.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     data = dataclasses.replace(tiny.data, clouds=3, clean_share=1.0, plain_share=1.0)
-    flat, solid, again = training_clouds(data, meshes=tmp_path)
+    flat, solid, again = Pools(data, meshes=tmp_path)(0)
     assert not np.ptp(flat.points[:, 2])
     assert not np.ptp(again.points[:, 2])
     assert np.ptp(solid.points, axis=0).min() > 0.3
@@ -264,7 +264,7 @@ def test_the_authors_layout(layout: Path, tiny: TrainingSettings) -> None:
     for cloud in clouds:
         assert cloud.radius == pytest.approx(0.05 * np.linalg.norm(np.ptp(cloud.clean.points, axis=0)))
         assert not cloud.later
-    assert len(list(training_clouds(tiny.data, clouds=layout))) == len(clouds)
+    assert len(Pools(tiny.data, clouds=layout)(0)) == len(clouds)
     batch = cut_batch(clouds, tiny.data, 0)
     assert set(batch.radii) <= {cloud.radius for cloud in clouds}
     assert {cloud.radius for cloud in load_author_clouds(layout, 0.0)} == {0.0}

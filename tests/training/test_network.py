@@ -76,11 +76,27 @@ def test_the_paper_s_network_has_the_paper_s_widths() -> None:
     assert (network(torch.randn(2, 5, 3)).abs() < 1).all()
 
 
+def test_the_mean_leaves_out_centre_and_padding() -> None:
+    torch.manual_seed(0)
+    network = Pointfilter(NetworkSettings((16, 32), (8,))).eval()
+    patches = torch.randn(3, 20, 3)
+    patches[:, 0] = 0
+    patches[1, 8:] = 0
+    layer, norm = network.encoder_layers()[0]
+    with torch.inference_mode():
+        features = network.encode(patches, torch.tensor([20, 8, 20]))
+        for patch, length in enumerate((20, 8, 20)):
+            expected = functional.relu(norm(layer(patches[patch, 1:length]))).mean(dim=0)
+            torch.testing.assert_close(features[patch, 32:], expected)
+        nothing = network.encode(torch.zeros(1, 5, 3), torch.tensor([1]))[:, 32:]
+    assert not nothing.any()
+
+
 def test_settings_survive_being_plain_values() -> None:
     settings = NetworkSettings((4, 5), (6,), True, True)
     assert NetworkSettings.from_dict(copy.deepcopy(vars(settings))) == settings
     before = NetworkSettings.from_dict({"encoder": [4, 5], "decoder": [6], "norm_after_pool": True})
-    assert before == NetworkSettings((4, 5), (6,), True, adaptive=False)
+    assert before == NetworkSettings((4, 5), (6,), True, adaptive=False, mean_pool=False)
 
 
 # --- the adaptive network ---
@@ -119,13 +135,16 @@ def test_what_queries_share_is_what_they_would_have_each(norm_after_pool: bool) 
         found = network.answer(patches, queries, owners, told)
         rows = patches
         for layer, norm in network.encoder_layers():
+            means = torch.stack(
+                [row[(patch != 0).any(dim=1)].mean(dim=0) for row, patch in zip(rows, patches, strict=True)]
+            )
             rows = functional.linear(rows, layer.weight, layer.bias)
             if not (norm_after_pool and norm is network.encoder_norms[-1]):
                 rows = functional.relu(norm(rows.flatten(0, 1)).view_as(rows))
         features = rows.amax(dim=1)
         if norm_after_pool:
             features = functional.relu(network.encoder_norms[-1](features))
-        values = torch.cat([features[owners], queries, told[owners]], dim=1)
+        values = torch.cat([features[owners], means[owners], queries, told[owners]], dim=1)
         for layer, norm in network.decoder_layers():
             values = functional.relu(norm(layer(values)))
         values = network.head(values)
@@ -141,7 +160,7 @@ def test_the_answer_depends_on_query_pass_and_count() -> None:
     with torch.inference_mode():
         expected = network.answer(patches, queries, owners, told)
         for changed in (
-            (patches, queries + 0.1, owners, told),
+            (patches, queries + 0.3, owners, told),
             (patches, queries, owners, told + torch.tensor([1.0, 0.0])),
             (patches, queries, owners, torch.stack([told[:, 0], 1 - told[:, 1]], dim=1)),
         ):

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -57,13 +56,13 @@ def test_settings_can_be_changed_one_by_one() -> None:
             "loss.eta=0.5",
             "network.encoder=[4, 5]",
             "data.noise_levels=[0.01, 0.02]",
-            "own_from=[5]",
+            "pool_steps=5",
             "learning_rate=1",
         ],
     )
     assert (settings.steps, settings.loss.eta, settings.network.encoder) == (7, 0.5, (4, 5))
     assert settings.data.noise_levels == (0.01, 0.02)
-    assert settings.own_from == (5,)
+    assert settings.pool_steps == 5
     assert settings.learning_rate == 1.0
     assert settings.data.clouds == load_preset("smoke").data.clouds
 
@@ -83,11 +82,11 @@ WRONG = {
     'optimizer="lion"': "adamw",
     'schedule="cosine"': "warmup-stable-decay",
     "decay=0": "decay must be above 0",
-    "own_from=[0.5]": "own_from",
+    "pool_steps=0": "pool_steps must be at least 1",
     'precision="float64"': "bfloat16",
     'loss.loss="chamfer"': "bilateral",
     'data.noise_levels=["much"]': "noise_levels",
-    "own_from=0.5": "own_from",
+    "pool_steps=0.5": "pool_steps",
     'loss.loss="l2"': "need each other",
     "network.adaptive=false": "need each other",
     'network.encoder=["wide"]': "encoder",
@@ -182,12 +181,10 @@ def test_a_signal_ends_a_run_with_a_checkpoint(
 def test_a_signal_before_the_first_batch_leaves_no_checkpoint(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def clouds(*_: object) -> Iterator[None]:
-        yield None
+    def cloud(*_: object) -> None:
         signal.raise_signal(signal.SIGTERM)
-        yield None
 
-    monkeypatch.setattr("training.train.training_clouds", clouds)
+    monkeypatch.setattr("training.pools.training_cloud", cloud)
     assert train(tmp_path / "run") == command.STOPPED
     assert "stopped" in capsys.readouterr().err
     assert not (tmp_path / "run" / "checkpoint.pt").exists()

@@ -12,11 +12,13 @@ import pytest
 import torch
 
 from pointfilter.network import context
+from tests.training.conftest import MadePools
 from training import own as own_module
 from training import train as train_module
-from training.dataset import Batch, TrainingCloud, cut_batch, training_clouds
+from training.dataset import Batch, TrainingCloud, cut_batch
 from training.network import NetworkSettings
 from training.own import as_network, own_clouds
+from training.pools import Pools
 from training.train import Run, TrainingSettings, start, training_record
 
 
@@ -49,33 +51,33 @@ def moving(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def straight(tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]) -> Run:
+def straight(tmp_path: Path, tiny: TrainingSettings, pools: MadePools) -> Run:
     run = Run(tmp_path / "straight", tiny)
-    run.train(clouds)
+    run.train(pools)
     return run
 
 
 @pytest.mark.parametrize("until", [1, 5, 6, 8])  # own clouds are made at step 6
 def test_a_run_that_was_stopped_goes_on_exactly(
-    until: int, straight: Run, tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]
+    until: int, straight: Run, tmp_path: Path, tiny: TrainingSettings, pools: MadePools
 ) -> None:
     first = Run(tmp_path / "stopped", tiny)
-    first.train(clouds, until)
+    first.train(pools, until)
     assert first.step == until
     second = Run(tmp_path / "stopped", tiny, saved(tmp_path / "stopped"))
     assert second.step == until
-    second.train(clouds)
+    second.train(pools)
     assert_same(straight, second)
 
 
-@pytest.mark.parametrize(("killed_at", "goes_on_from"), [(5, 4), (7, 4), (10, 9)])
+@pytest.mark.parametrize(("killed_at", "goes_on_from"), [(5, 4), (7, 6), (10, 9)])
 def test_a_run_that_was_killed_goes_on_from_its_checkpoint_exactly(
     killed_at: int,
     goes_on_from: int,
     straight: Run,
     tmp_path: Path,
     tiny: TrainingSettings,
-    clouds: list[TrainingCloud],
+    pools: MadePools,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with monkeypatch.context() as patch:
@@ -89,10 +91,10 @@ def test_a_run_that_was_killed_goes_on_from_its_checkpoint_exactly(
 
         patch.setattr(train_module, "batches_ahead", killed)
         with pytest.raises(KeyboardInterrupt):
-            Run(tmp_path / "killed", tiny).train(clouds)
+            Run(tmp_path / "killed", tiny).train(pools)
     second = Run(tmp_path / "killed", tiny, saved(tmp_path / "killed"))
     assert second.step == goes_on_from
-    second.train(clouds)
+    second.train(pools)
     assert_same(straight, second)
 
 
@@ -151,13 +153,13 @@ def test_a_run_writes_its_curve_and_its_settings(straight: Run) -> None:
     described = json.loads((straight.folder / "settings.json").read_text())
     assert TrainingSettings.from_dict(described) == straight.settings
     files = sorted(path.name for path in straight.folder.iterdir())
-    assert files == ["checkpoint.pt", "log.csv", "own-6.npz", "settings.json", "stable.pt"]
+    assert files == ["checkpoint.pt", "log.csv", "own-1.npz", "settings.json", "stable.pt"]
 
 
-def test_validation_is_in_the_curve(tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]) -> None:
+def test_validation_is_in_the_curve(tmp_path: Path, tiny: TrainingSettings, pools: MadePools) -> None:
     settings = dataclasses.replace(tiny, steps=2, validate_every=2, validation_clouds=1)
     run = Run(tmp_path, settings)
-    run.train(clouds)
+    run.train(pools)
     (row,) = run.history
     assert list(row)[-2:] == ["validation_loss", "validation_distance"]
     assert np.isfinite(row["validation_loss"])
@@ -179,7 +181,7 @@ def test_validation_s_loss_is_that_of_the_run_s_progress(
         return real(*arguments, progress=progress)
 
     monkeypatch.setattr(train_module, "filtering_loss", loss)
-    Run(tmp_path, settings).train(list(training_clouds(settings.data)))
+    Run(tmp_path, settings).train(Pools(settings.data))
     assert seen == [0.5, 1.0]
 
 
@@ -194,6 +196,7 @@ def test_training_lowers_the_loss(
     tiny: TrainingSettings,
     tiny_paper: TrainingSettings,
     clouds: list[TrainingCloud],
+    pools: MadePools,
 ) -> None:
     settings = tiny if adaptive else tiny_paper
     settings = dataclasses.replace(
@@ -206,7 +209,7 @@ def test_training_lowers_the_loss(
         weight_decay=0.0,
         validate_every=10**6,
         checkpoint_every=10**6,
-        own_from=(),
+        pool_steps=1000,
     )
     run = Run(tmp_path, settings)
     batch = cut_batch(clouds, dataclasses.replace(settings.data, batch=128), 10**6)
@@ -217,7 +220,7 @@ def test_training_lowers_the_loss(
             return run._loss(run.network, batch, clouds, 0)[0].item()
 
     before = loss()
-    run.train(clouds)
+    run.train(pools)
     assert loss() < before - 0.2 * abs(before)
 
 
@@ -234,12 +237,12 @@ def test_gradients_are_clipped_where_there_is_a_limit(
     calls: list[float],
     tmp_path: Path,
     tiny: TrainingSettings,
-    clouds: list[TrainingCloud],
+    pools: MadePools,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     seen: list[float] = []
     monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", lambda _, largest: seen.append(largest))
-    Run(tmp_path, dataclasses.replace(tiny, gradient_clip=limit)).train(clouds, 2)
+    Run(tmp_path, dataclasses.replace(tiny, gradient_clip=limit)).train(pools, 2)
     assert seen == calls
 
 
@@ -280,12 +283,12 @@ def test_own_clouds_are_a_share_of_the_clouds(
 
 def test_own_clouds_keep_a_fixed_radius(tmp_path: Path, straight: Run, tiny: TrainingSettings) -> None:
     settings = dataclasses.replace(tiny.data, radius=0.2, own_points=100)
-    (own,) = own_clouds(tmp_path / "own.npz", list(training_clouds(settings)), straight._trained(), settings)
+    (own,) = own_clouds(tmp_path / "own.npz", Pools(settings)(0), straight._trained(), settings)
     assert own.radius == pytest.approx(0.2, rel=0.05)
 
 
 def test_a_run_trains_on_its_own_clouds_as_later_ones(
-    tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, tiny: TrainingSettings, pools: MadePools, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     later: list[bool] = []
     real = train_module.batches_ahead
@@ -297,17 +300,17 @@ def test_a_run_trains_on_its_own_clouds_as_later_ones(
 
     monkeypatch.setattr(train_module, "batches_ahead", watched)
     settings = dataclasses.replace(tiny, data=dataclasses.replace(tiny.data, own_share=1.0))
-    Run(tmp_path, settings).train(clouds)
+    Run(tmp_path, settings).train(pools)
     assert later == [False] * 6 + [True] * 6
 
 
 def test_a_new_run_takes_no_own_clouds_of_another(
-    tmp_path: Path, straight: Run, tiny: TrainingSettings, clouds: list[TrainingCloud]
+    tmp_path: Path, straight: Run, tiny: TrainingSettings, pools: MadePools
 ) -> None:
     """A run that was killed before its first checkpoint leaves its folder to the next one."""
-    np.savez(tmp_path / "own-6.npz", **{"0": np.random.default_rng(0).normal(size=(300, 3))})
+    np.savez(tmp_path / "own-1.npz", **{"0": np.random.default_rng(0).normal(size=(300, 3))})
     run = Run(tmp_path, tiny)
-    run.train(clouds)
+    run.train(pools)
     assert_same(straight, run)
 
 
@@ -348,12 +351,12 @@ def test_the_seed_decides_the_weights(tmp_path: Path, tiny: TrainingSettings) ->
 
 
 def test_the_learning_rate_warms_up_stays_and_falls_to_nothing(
-    tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]
+    tmp_path: Path, tiny: TrainingSettings, pools: MadePools
 ) -> None:
-    run = Run(tmp_path, dataclasses.replace(tiny, steps=20, own_from=(), learning_rate=1e-2))
+    run = Run(tmp_path, dataclasses.replace(tiny, steps=20, pool_steps=1000, learning_rate=1e-2))
     rates = [run.scheduler.get_last_lr()[0]]
     for step in range(1, 21):
-        run.train(clouds, step)
+        run.train(pools, step)
         rates.append(run.scheduler.get_last_lr()[0])
     assert rates[:3] == pytest.approx([1e-2 / 3, 2e-2 / 3, 1e-2])
     assert rates[3:16] == [1e-2] * 13
@@ -362,12 +365,12 @@ def test_the_learning_rate_warms_up_stays_and_falls_to_nothing(
 
 @pytest.mark.parametrize("stopped_at", [5, 12])  # before the learning rate falls; at the end, after it fell
 def test_a_run_made_longer_is_one_that_was_longer_from_the_start(
-    stopped_at: int, tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]
+    stopped_at: int, tmp_path: Path, tiny: TrainingSettings, pools: MadePools
 ) -> None:
     longer = dataclasses.replace(tiny, steps=20)
     warm = dataclasses.replace(tiny, steps=12)
     straight = Run(tmp_path / "straight", longer)
-    straight.train(clouds)
+    straight.train(pools)
     start(tmp_path / "run", warm, until=stopped_at)
     again = start(tmp_path / "run", warm, resume=True, steps=20)
     assert again.settings == longer
@@ -384,14 +387,14 @@ def test_a_run_cannot_get_another_length_once_the_rate_has_fallen(tmp_path: Path
 
 
 def test_the_paper_s_schedule_ends_where_the_paper_says(
-    tmp_path: Path, tiny: TrainingSettings, clouds: list[TrainingCloud]
+    tmp_path: Path, tiny: TrainingSettings, pools: MadePools
 ) -> None:
     settings = dataclasses.replace(
         tiny, optimizer="sgd", schedule="exponential", learning_rate=1e-4, final_learning_rate=1e-8
     )
     run = Run(tmp_path, settings)
     assert run.scheduler.get_last_lr()[0] == pytest.approx(1e-4)
-    run.train(clouds)
+    run.train(pools)
     assert run.scheduler.get_last_lr()[0] == pytest.approx(1e-8, rel=1e-6)
 
 
@@ -412,7 +415,7 @@ def test_a_network_is_a_plain_callable(straight: Run) -> None:
 
 def test_the_paper_s_network_is_one_too(tmp_path: Path, tiny_paper: TrainingSettings) -> None:
     network = Run(tmp_path, tiny_paper)._trained()
-    assert network.settings == NetworkSettings((8, 16), (8,), adaptive=False)
+    assert network.settings == NetworkSettings((8, 16), (8,), adaptive=False, mean_pool=False)
     patches = np.random.default_rng(0).uniform(-1, 1, (4, 9, 3)).astype(np.float32)
     none = np.zeros((4, 3), np.float32)
     found = as_network(network)(patches, none[:, :2], none, np.arange(4))
