@@ -45,7 +45,7 @@ from benchmarks.parts import part_line, part_rows, part_table
 from benchmarks.scenes import SCENES
 from benchmarks.subjects import COLUMNS, MESH_POINTS, SETS, SHAPE_POINTS, Column, Subject, at_points
 from pointfilter.engine import Engine
-from pointfilter.filter import DEFAULT_ITERATIONS, Filtered, filter_points
+from pointfilter.filter import Filtered, default_passes, filter_points
 from pointfilter.metrics import closest_on_surface
 from pointfilter.models import ModelBundle, available_models, open_model
 from pointfilter.noise import bounding_box_diagonal
@@ -262,7 +262,7 @@ def _filtered(noisy: Float64, engine: Engine) -> tuple[dict[str, tuple[Float64, 
     """
     seen: dict[int, tuple[Float64, float]] = {}
     calibration = engine.bundle.calibration
-    automatic = DEFAULT_ITERATIONS if calibration is None else calibration.passes
+    automatic = default_passes(calibration)
     started = time.perf_counter()
     result = filter_points(
         noisy,

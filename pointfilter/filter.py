@@ -105,13 +105,10 @@ def filter_points(
     Raises TooFewPointsError, DegenerateCloudError, ParameterError, FilteringCancelledError.
     """
     points = checked(points, iterations, seed, patch_points, threads)
-    if calibration is None:
-        radius = resolve_radius(points, radius)
-        passes = DEFAULT_ITERATIONS if iterations is None else iterations
-    else:
-        resolved = resolve_radius(points, radius)  # checks the extent, too
-        radius = None if radius is None else resolved
-        passes = calibration.passes if iterations is None else iterations
+    passes = default_passes(calibration) if iterations is None else iterations
+    resolved = resolve_radius(points, radius)  # checks the extent, too
+    if radius is not None or calibration is None:
+        radius = resolved
 
     def check() -> None:
         if cancelled is not None and cancelled():
@@ -178,6 +175,11 @@ def filter_points(
         placeholder_rows=places.placeholder_rows,
         seconds=clock.seconds,
     )
+
+
+def default_passes(calibration: Calibration | None) -> int:
+    """Most passes where the caller names no number of them."""
+    return DEFAULT_ITERATIONS if calibration is None else calibration.passes
 
 
 class _State:

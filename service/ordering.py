@@ -11,6 +11,7 @@ from fastapi import Depends, Query
 
 from pointfilter.attributes import check_normals, parse_columns
 from pointfilter.errors import ParameterError
+from pointfilter.filter import default_passes
 from pointfilter.models import AUTO, ModelBundle
 from pointfilter.pipeline import Radius
 from service.dependencies import CallerDep, ExchangeDep, HouseDep
@@ -47,12 +48,12 @@ async def _order(
     house: HouseDep,
     chosen: ChosenDep,
     iterations: Annotated[
-        str | None,
+        str,
         Query(
             description="Most passes over the cloud: a number from 1 on, or auto for the model's own limit (default)",
             json_schema_extra={"pattern": "^(auto|[1-9][0-9]*)$"},
         ),
-    ] = None,
+    ] = AUTO,
     radius: Annotated[
         str | None,
         Query(
@@ -95,9 +96,10 @@ async def _order(
 ) -> Order:
     """Raises ParameterError, ModelError."""
     check_normals(normals, chosen.bundle, paper)
+    usual, most = default_passes(None if paper else chosen.bundle.calibration), house.settings.max_iterations
     return Order(
         model=chosen.name,
-        iterations=None if iterations is None else _iterations(iterations, house.settings.max_iterations),
+        iterations=_iterations(iterations, usual, most),
         radius=None if radius is None else Radius.parse(radius),
         seed=seed,
         encoding=format,
@@ -120,10 +122,10 @@ async def _look_order(chosen: ChosenDep, seed: Seed = 0) -> LookOrder:
 LookOrderDep = Annotated[LookOrder, Depends(_look_order)]
 
 
-def _iterations(text: str, most: int) -> int | None:
-    """Raises ParameterError."""
+def _iterations(text: str, usual: int, most: int) -> int | None:
+    """The number in a request that may ask for at most so many; None for the usual one. Raises ParameterError."""
     if text == AUTO:
-        return None
+        return None if usual <= most else most
     number = int(text) if re.fullmatch(r"-?[0-9]{1,9}", text) else None
     if number is None or not 1 <= number <= most:
         raise ParameterError(

@@ -115,6 +115,14 @@ def test_limits_and_knobs_are_named(make_client: Callable[..., TestClient], ply:
     assert "POINTFILTER_MAX_UPLOAD_BYTES" in str(problem["hint"])
 
 
+@pytest.mark.parametrize(("limit", "passes"), [(1, "1"), (2, "2"), (3, "2")])
+def test_the_limit_of_passes_holds_where_none_are_named(
+    make_client: Callable[..., TestClient], ply: bytes, limit: int, passes: str
+) -> None:
+    answer = make_client(max_iterations=limit).post("/filter?paper=true", content=ply)
+    assert answer.headers["x-iterations"] == passes
+
+
 def test_a_file_of_exactly_the_limit_is_taken(make_client: Callable[..., TestClient], ply: bytes) -> None:
     client = make_client(max_upload_bytes=len(ply))
     assert client.post("/filter", content=ply).status_code == 200
