@@ -22,12 +22,12 @@ from training.shapes import Mesh, random_shape
 Float64 = NDArray[np.float64]
 
 FAMILY = 2  # of shapes; training has family 0, validation family 1
-CLOUDS = 8
+CLOUDS = 15
 POINTS = (4_000, 12_000)
-LEVELS = (0.0025, 0.006, 0.012, 0.025)  # of the noise, in turn; fractions of the diagonal
+LEVELS = (0.001, 0.0025, 0.006, 0.012, 0.025)  # of the noise, in turn; fractions of the diagonal
 MEASURED_POINTS = 1_500  # of a cloud, whose distances are taken
-PREFERENCES = (-0.1, 0.0, 0.1, 0.2)
-STILL_WEIGHTS = (0.5, 0.75, 1.0)
+PREFERENCES = (-0.2, -0.1, 0.0, 0.1, 0.2)
+STILL_WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 MARGINS = (0.0, 0.1, 0.2)
 MOST_LOSS = 0.01  # of the error on noisy clouds, that a larger margin may cost for leaving clean ones as they are
 
@@ -63,11 +63,10 @@ def calibrate(serialised: bytes, patch_points: int) -> Calibration:
         if cost(larger) <= least + MOST_LOSS:
             chosen = larger
     factors = [
-        np.log(distances[told].mean() / expected[told].mean())
+        np.log(distances[told := np.isfinite(expected)].mean() / expected[told].mean())
         for distances, expected in measured(chosen)
-        if (told := np.isfinite(expected)).any()  # the network may have left the cloud alone
     ]
-    return dataclasses.replace(chosen, error_factor=float(np.exp(np.mean(factors))) if factors else 1.0)
+    return dataclasses.replace(chosen, error_factor=float(np.exp(np.mean(factors))))
 
 
 def _cloud(number: int, level: float) -> _Cloud:

@@ -127,9 +127,11 @@ def filter_points(
         with clock.measure("balls"):
             key = sampling_key(seed, 0)
             probes = probe_balls(places.points, keys, reach, network, calibration, patch_points, key, threads, check)
-            state.radii[:], _, gains = probes.spread(places.points, threads)
+            state.radii[:], _, gains, errors = probes.spread(places.points, threads)
         state.radii[np.isinf(state.radii)] = np.nan  # there is no ball
         state.moving[gains > -calibration.margin] = False  # no ball helps there
+        still = np.flatnonzero(~state.moving & np.isfinite(errors))
+        state.expect(still, np.log(errors[still]))
     else:
         state.moving[:] = False
 

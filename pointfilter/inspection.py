@@ -150,7 +150,7 @@ def _balls(places: Float64, engine: Engine, seed: int, check: Callable[[], None]
     probes = probe_balls(
         places, keys, reach, engine, bundle.calibration, bundle.patch_points, key, engine.threads, check
     )
-    values = np.stack(probes.spread(places, engine.threads))
+    values = np.stack(probes.spread(places, engine.threads)[:3])
     values[:, np.isinf(values[0])] = np.nan
     known = probes.errors[np.isfinite(probes.errors)]
     return _Balls(values[0], values[1], values[2], float(np.median(known)) if len(known) else None)

@@ -41,12 +41,14 @@ class Probes:
     gains: Float64
     errors: Float64
 
-    def spread(self, points: Float64, threads: int) -> tuple[Float64, Float64, Float64]:
-        """For (n, 3) points radii, ball_points and gains, each (n,) float64: means over the SPREAD nearest probes, of
-        the logarithms for radii and ball_points."""
+    def spread(self, points: Float64, threads: int) -> tuple[Float64, Float64, Float64, Float64]:
+        """For (n, 3) points radii, ball_points, gains and errors, each (n,) float64: means over the SPREAD nearest
+        probes, of the logarithms except for gains."""
         near = _nearest(self.points, points, SPREAD, threads)
-        radii, ball_points = (np.exp(np.log(each)[near].mean(axis=1)) for each in (self.radii, self.ball_points))
-        return radii, ball_points, self.gains[near].mean(axis=1)
+        radii, ball_points, errors = (
+            np.exp(np.log(each)[near].mean(axis=1)) for each in (self.radii, self.ball_points, self.errors)
+        )
+        return radii, ball_points, self.gains[near].mean(axis=1), errors
 
 
 def has_balls(count: int, calibration: Calibration) -> bool:

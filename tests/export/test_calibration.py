@@ -108,7 +108,10 @@ def test_the_error_factor_makes_expected_errors_real_ones(monkeypatch: pytest.Mo
     assert np.exp(np.mean(np.log(ratios))) == pytest.approx(1, rel=1e-6)
 
 
-def test_a_network_that_moves_nothing_has_no_factor(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_factor_of_a_network_that_moves_nothing_is_that_of_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     found = of(staying, monkeypatch)
-    assert found.error_factor == 1
-    assert dataclasses.replace(found, preference=0.05, still_weight=1.0, margin=0.0) == UNCALIBRATED
+    cloud = module._cloud(0, module.LEVELS[0])
+    filtered = module._filtered(cloud, staying, found, 32)
+    assert not filtered.moved.any()
+    assert np.isfinite(filtered.errors).all()
+    assert found.error_factor != 1

@@ -101,7 +101,7 @@ def balls(points: np.ndarray, network: object, **changes: object) -> tuple[np.nd
     keys, reach = neighbourhood_keys(points)
     calibration = dataclasses.replace(CALIBRATION, **changes)
     probes = probe_balls(points, keys, reach, network, calibration, 50, 1, 2, lambda: None)
-    radii, _, gains = probes.spread(points, 2)
+    radii, _, gains, _ = probes.spread(points, 2)
     return radii, gains
 
 
@@ -351,6 +351,17 @@ def test_a_ball_with_too_few_points_moves_nothing_whatever_is_expected_of_it() -
     assert result.moved[:500].all()
     assert np.isnan(result.errors[500:]).all()  # nothing is known of them
     assert np.isfinite(result.errors[:500]).all()
+
+
+def test_the_error_of_points_that_no_ball_helps_is_that_without_a_filter() -> None:
+    points = plane(800)
+    result = filter_points(points, saying({24: 0.5, 192: 0.5}), calibration=CALIBRATION, patch_points=50)
+    assert not result.moved.any()
+    assert result.passes == 0
+    keys, reach = neighbourhood_keys(points)
+    network = saying({24: 0.5, 192: 0.5})
+    probes = probe_balls(points, keys, reach, network, CALIBRATION, 50, 1, 1, lambda: None)
+    np.testing.assert_allclose(np.median(result.errors), CALIBRATION.error_factor * np.median(probes.errors), rtol=0.1)
 
 
 def test_too_few_points_for_the_smallest_ball_come_back() -> None:
