@@ -89,7 +89,9 @@ def with_normals(
     notes = []
     if unknown.any():
         given = "keep their old normal" if found else "have the normal 0 0 0"
-        notes.append(f"{unknown.sum()} rows got no normal from the network, as where no ball helps, and {given}")
+        notes.append(
+            f"{unknown.sum()} rows got no normal from the network, as where too few points are around, and {given}"
+        )
     return cloud.with_columns(dict(zip(NORMAL_COLUMNS, new.T, strict=True))), notes
 
 

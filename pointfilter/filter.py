@@ -84,6 +84,7 @@ def filter_points(
     patch_points: int = 500,
     seed: int = 0,
     threads: int = 1,
+    normals: bool = False,
     origin: Float64 | None = None,
     progress: Callable[[int, int], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
@@ -97,8 +98,9 @@ def filter_points(
 
     radius: of all balls, in the unit of the points; by default chosen, or DEFAULT_RADIUS of the bounding-box diagonal
     in the paper's mode. iterations: most passes. patch_points: N, what the network was trained with. seed: of the
-    downsampling. threads: how many batches are evaluated at once; the result does not depend on it. origin: subtracted
-    from the coordinates, by default the middle of the bounding box; pieces of one cloud must share it.
+    downsampling. threads: how many batches are evaluated at once; the result does not depend on it. normals: ask for
+    those of points that no pass looked at, too. origin: subtracted from the coordinates, by default the middle of the
+    bounding box; pieces of one cloud must share it.
     progress(done, total) is called from this thread, in rows times passes, and never goes backwards. cancelled() is
     asked between batches, from any thread. after_pass(passes, points) sees the points after every pass.
 
@@ -157,6 +159,12 @@ def filter_points(
         made += 1
         if after_pass is not None:
             after_pass(made, result())
+    without = np.isfinite(state.radii) & np.isnan(state.normals[:, 0])
+    if normals and calibration is not None and without.any():
+        asked = _State(state.points, keys)
+        asked.radii[:], asked.moving[:] = state.radii, without
+        _one_pass(asked, made, network, calibration, patch_points, seed, threads, lambda _: None, check, clock)
+        state.normals[without] = asked.normals[without]
     if progress is not None:
         progress(total, total)
     filtered = result()

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pointfilter.attributes import (
     KEEP,
+    RECOMPUTE,
     check_new_columns,
     check_normal_columns,
     check_normals,
@@ -154,6 +155,7 @@ def filter_cloud(
         patch_points=bundle.patch_points,
         seed=seed,
         threads=engine.threads,
+        normals=normals == RECOMPUTE,
         progress=progress,
         cancelled=cancelled,
     )

@@ -73,8 +73,11 @@ class DataSettings:
     """A fifth of the clouds are filtered."""
     own_points: int = 8_000
     """Most points of such a cloud: a piece of a whole one, since filtering costs more than anything else here."""
-    patch_points: int = 192
-    """Points of a noisy patch."""
+    patch_points: int = 384
+    """Most points of a noisy patch."""
+    fewest_patch_points: int = 96
+    """A larger ball is thinned to a number of points drawn evenly between the two: a patch of 96 costs a quarter of one
+    of 384, and the network learns how the number of points changes what it sees."""
     clean_patch_points: int = 400
     """Clean points in the ball that the losses of the paper see."""
     batch: int = 64
@@ -100,7 +103,7 @@ class TrainingCloud:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """B patches and M queries. patches: (B, N, 3) float32. counts: (B,) int64, points in their balls. context: (B, 2),
+    """B patches and M queries. patches: (B, N, 3) float32. counts: (B,) int64, points that are not padding. context: (B, 2),
     see network.context. queries: (M, 3) float32, in the frames of their patches. owners: (M,) int64, their patches.
     still: (M,), distance of a query to the surface.
 
@@ -211,29 +214,32 @@ def cut_batch(clouds: Sequence[TrainingCloud], settings: DataSettings, step: int
     each = -(-settings.batch // settings.clouds_per_batch)
     first = [number for number, cloud in enumerate(clouds) if not cloud.later]
     later = [number for number, cloud in enumerate(clouds) if cloud.later]
-    numbers, centres, patches, frames, counts, radii = [], [], [], [], [], []
+    numbers, centres, patches, frames, counts, lengths, radii = [], [], [], [], [], [], []
+    fewest = min(settings.fewest_patch_points, settings.patch_points)
     for _ in range(settings.clouds_per_batch):
         group = later if later and rng.random() < settings.own_share else first
         number = group[int(rng.integers(len(group)))]
         cloud = clouds[number]
         rows = rng.integers(len(cloud.points), size=each)
         key = int(rng.integers(2**63))
-        patch = cloud.index.patches(rows, _radii(cloud, rows, settings, rng), settings.patch_points, key)
+        length = int(rng.integers(fewest, settings.patch_points + 1))
+        patch = cloud.index.patches(rows, _radii(cloud, rows, settings, rng), length, key)
         numbers.append(np.full(each, number))
         centres.append(cloud.points[rows])
-        patches.append(patch.points)
+        patches.append(np.pad(patch.points, ((0, 0), (0, settings.patch_points - length), (0, 0))))
         frames.append(patch.frames)
         counts.append(patch.counts)
+        lengths.append(np.minimum(patch.counts, length))
         radii.append(patch.radii)
 
     def joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         return np.concatenate(parts)[: settings.batch]
 
     numbers_of, points = joined(numbers), joined(patches)
-    queries, owners = _queries(points, joined(counts), settings, rng)
+    queries, owners = _queries(points, joined(lengths), settings, rng)
     batch = Batch(
         patches=torch.from_numpy(points),
-        counts=torch.from_numpy(joined(counts)),
+        counts=torch.from_numpy(joined(lengths)),
         context=context(
             torch.from_numpy(np.maximum(joined(counts), 1)),
             torch.tensor([clouds[number].later for number in numbers_of]),
@@ -269,7 +275,7 @@ def _queries(
     """The centre of each patch and random points of it near the centre: (M, 3) float32, and their patches (M,)."""
     batch, length, _ = patches.shape
     near = np.square(patches).sum(axis=2) < settings.query_reach**2
-    near &= np.arange(length) < np.minimum(counts, length)[:, None]
+    near &= np.arange(length) < counts[:, None]
     order = np.argsort(np.where(near, rng.random((batch, length)), 2.0), axis=1)[:, : settings.queries - 1]
     rows = np.arange(batch)[:, None]
     chosen = near[rows, order]

@@ -120,8 +120,8 @@ class Pointfilter(nn.Module):
         return _pairs(self.decoder, self.decoder_norms)
 
     def encode(self, patches: Tensor, counts: Tensor | None = None) -> Tensor:
-        """The feature vectors (B, C) of patches (B, N, 3). counts: (B,) int64, points in their balls; rows that are
-        padding cost nothing then."""
+        """The feature vectors (B, C) of patches (B, N, 3). counts: (B,) int64, points of the patches; rows that
+        are padding cost nothing then."""
         batch, points, _ = patches.shape
         groups = [(points, torch.arange(batch))]
         if counts is not None:

@@ -48,8 +48,8 @@ class TrainingSettings:
     network: NetworkSettings = field(default_factory=NetworkSettings)
     data: DataSettings = field(default_factory=DataSettings)
     loss: LossSettings = field(default_factory=LossSettings)
-    steps: int = 48_000
-    pool_steps: int = 12_000
+    steps: int = 40_000
+    pool_steps: int = 10_000
     """Steps with one pool of clouds. From the second pool on the network filters some of them first: later passes see
     its own outputs."""
     optimizer: str = "adamw"

@@ -10,6 +10,7 @@ import pytest
 from pointfilter import Engine, PointCloud, Radius, filter_cloud
 from pointfilter.attributes import parse_columns, signed
 from pointfilter.errors import ParameterError
+from pointfilter.filter import filter_points
 from tests.ply_files import ORDERS, Column, Table, write_ply
 
 ENCODINGS = ["ascii", *ORDERS]
@@ -146,10 +147,37 @@ def test_normals_are_recomputed_on_their_old_side(
     np.testing.assert_allclose(np.linalg.norm(new[answered], axis=1), 1, atol=1e-6)
     cosines = np.sum(new * normals_of(noisy_crease), axis=1)[answered]
     assert np.median(-cosines) > 0.95
-    assert f"{(~answered).sum()} rows got no normal from the network, as where no ball helps, and keep" in str(
-        report.warnings
-    )
+    assert answered.sum() == len(points) - 1
+    assert f"{(~answered).sum()} rows got no normal from the network, as where too few points" in str(report.warnings)
     np.testing.assert_array_equal(again.xyz, filter_cloud(cloud, default_engine)[0].xyz.astype(again.column_types["x"]))
+
+
+def test_points_that_stay_get_normals_too_and_no_point_moves_for_them(
+    default_engine: Engine, noisy_crease: np.ndarray
+) -> None:
+    clean = noisy_crease.copy()
+    clean[:, 2] = 0  # a plane
+    for points in (clean, noisy_crease):
+        calibration = default_engine.bundle.calibration
+        plain, asked = (
+            filter_points(
+                points,
+                default_engine,
+                calibration=calibration,
+                patch_points=default_engine.bundle.patch_points,
+                normals=wanted,
+            )
+            for wanted in (False, True)
+        )
+        np.testing.assert_array_equal(plain.points, asked.points)
+        np.testing.assert_array_equal(plain.errors, asked.errors)
+        assert np.isfinite(asked.normals).all()
+        known = np.isfinite(plain.normals)
+        np.testing.assert_array_equal(plain.normals[known], asked.normals[known])
+    flat = filter_points(
+        clean, default_engine, calibration=calibration, patch_points=default_engine.bundle.patch_points, normals=True
+    )
+    assert np.median(np.abs(flat.normals[:, 2])) > 0.98
 
 
 def test_normals_are_added_to_a_file_without(default_engine: Engine, noisy_crease: np.ndarray, tmp_path: Path) -> None:
