@@ -97,8 +97,8 @@ class Settings(BaseSettings):
     """Most points of a cloud; more get a 413."""
 
     max_iterations: Annotated[int, Field(ge=1, le=100)] = 10
-    """Most passes over the cloud: a request that asks for more (`iterations`) gets a 422, one that names no number gets no
-    more."""
+    """Most passes over the cloud: a request that asks for more (`iterations`) gets a 422, one that names no
+    number gets no more."""
 
     timeout_seconds: Annotated[float, Field(gt=0)] = 600.0
     """Longest time from the end of the upload to the finished result, waiting included; then the work stops: 504."""

@@ -103,9 +103,9 @@ class TrainingCloud:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """B patches and M queries. patches: (B, N, 3) float32. counts: (B,) int64, points that are not padding. context: (B, 2),
-    see network.context. queries: (M, 3) float32, in the frames of their patches. owners: (M,) int64, their patches.
-    still: (M,), distance of a query to the surface.
+    """B patches and M queries. patches: (B, N, 3) float32. counts: (B,) int64, points that are not padding. context:
+    (B, 2), see network.context. queries: (M, 3) float32, in the frames of their patches. owners: (M,) int64, their
+    patches. still: (M,), distance of a query to the surface.
 
     clouds: (B,), the number of the cloud of each patch. centres: (B, 3), frames: (B, 3, 3) and radii: (B,), float64.
     """
