@@ -70,6 +70,24 @@ def test_shapes_of_a_batch(clouds: list[TrainingCloud], tiny: TrainingSettings) 
         assert (clouds[number].points == batch.centres[row]).all(axis=1).any()
 
 
+def test_balls_are_thinned_to_between_two_numbers_of_points(tiny: TrainingSettings) -> None:
+    points = np.random.default_rng(0).normal(size=(400, 3))
+    cloud = make_cloud(points, make_clean(points, np.tile([0.0, 0, 1], (400, 1))))
+    data = dataclasses.replace(
+        tiny.data, smallest_ball=50, patch_points=40, fewest_patch_points=10, batch=256, clouds_per_batch=128
+    )
+    batch = cut_batch([cloud], data, 0)
+    counts = batch.counts.numpy()
+    assert (counts.min(), counts.max()) == (10, 40)
+    assert 20 < counts.mean() < 30
+    written = batch.patches.numpy().any(axis=2)
+    for row, count in enumerate(counts):
+        assert not written[row, count:].any()
+        assert written[row].sum() == count - 1  # all but the centre, which is the origin
+    fixed = cut_batch([cloud], dataclasses.replace(data, fewest_patch_points=40), 0)
+    assert (fixed.counts == 40).all()
+
+
 def test_the_context_of_a_patch_is_what_its_ball_holds(clouds: list[TrainingCloud], tiny: TrainingSettings) -> None:
     batch = cut_batch(clouds, tiny.data, 1)
     held = 2 ** (6 * (batch.context[:, 0].numpy() + 1))
@@ -108,7 +126,7 @@ def test_queries_are_the_centre_and_points_within_reach(tiny: TrainingSettings) 
     rng = np.random.default_rng(0)
     patches = rng.uniform(-0.6, 0.6, (5, 40, 3)).astype(np.float32)
     patches[:, 0] = 0
-    counts = np.array([40, 12, 1, 400, 25])
+    counts = np.array([40, 12, 1, 40, 25])
     for row, count in enumerate(counts):
         patches[row, count:] = 0
     data = dataclasses.replace(tiny.data, queries=6, query_reach=0.45)
