@@ -28,7 +28,7 @@ LEVELS = (0.001, 0.0025, 0.006, 0.012, 0.025)  # of the noise, in turn; fraction
 MEASURED_POINTS = 1_500  # of a cloud, whose distances are taken
 PREFERENCES = (-0.2, -0.1, 0.0, 0.1, 0.2)
 STILL_WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
-MARGINS = (0.0, 0.1, 0.2)
+MARGINS = (0.0, 0.05, 0.1, 0.2, 0.3)
 MOST_LOSS = 0.01  # of the error on noisy clouds, that a larger margin may cost for leaving clean ones as they are
 
 

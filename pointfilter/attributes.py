@@ -141,9 +141,9 @@ def with_figures(
     cloud, finite, result, displacements: as for with_normals. points: (m, 3), the rows before filtering.
 
     scalar_displacement: length of the move. scalar_uncertainty: expected distance to the surface after filtering; NaN
-    where the filter does not know it, as where too few points are around, and where the move was shortened. scalar_outlier: 1
-    where the point took no ball, or one of fewer than MIN_NEIGHBOURS points, or where the expected error after the
-    unlimited move is larger than OUTLIER_SHARE of the radius of its ball; else 0.
+    where the filter does not know it, as where too few points are around, and where the move was shortened.
+    scalar_outlier: 1 where the point took no ball, or one of fewer than MIN_NEIGHBOURS points, or where the expected
+    error after the unlimited move is larger than OUTLIER_SHARE of the radius of its ball; else 0.
     """
     added = {}
     for name in columns:

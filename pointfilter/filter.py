@@ -93,8 +93,8 @@ def filter_points(
     """Filters (n, 3) finite float64 points.
 
     With a calibration, the network's own, every point takes the ball in which the least error is expected, moves where
-    that is better than staying, and goes through as many passes as help. Without one, the paper's mode: one radius, and
-    `iterations` passes that move every point.
+    that is better than staying by the calibration's margin, and goes through as many passes as help. Without one, the
+    paper's mode: one radius, and `iterations` passes that move every point.
 
     radius: of all balls, in the unit of the points; by default chosen, or DEFAULT_RADIUS of the bounding-box diagonal
     in the paper's mode. iterations: most passes. patch_points: N, what the network was trained with. seed: of the
@@ -131,7 +131,7 @@ def filter_points(
             probes = probe_balls(places.points, keys, reach, network, calibration, patch_points, key, threads, check)
             state.radii[:], _, gains, errors = probes.spread(places.points, threads)
         state.radii[np.isinf(state.radii)] = np.nan  # there is no ball
-        state.moving[gains > -calibration.margin] = False  # no ball helps there
+        state.moving[gains > -calibration.margin] = False  # no ball helps there enough to touch the point
         still = np.flatnonzero(~state.moving & np.isfinite(errors))
         state.expect(still, np.log(errors[still]))
     else:
@@ -278,7 +278,7 @@ def _one_pass(
     better = np.ones(len(rows), dtype=bool)
     if calibration is not None and log_errors is not None:
         log_moved, log_still = log_errors.T
-        better = log_still - log_moved > calibration.margin  # not where nothing was told: NaN
+        better = log_moved < log_still  # not where nothing was told: NaN
         state.expect(rows, np.where(better, log_moved, log_still))
         state.moving[rows] = better
     after = before.copy()

@@ -20,7 +20,8 @@ class Calibration:
     """Balls are compared by the logarithm of the expected error, less so much of that of the error without a filter: 1
     compares shares, in which what a ball knows wrongly cancels out, 0 the errors themselves."""
     margin: float
-    """By how much the logarithm of the error must fall for a point to move."""
+    """By how much a ball must lower the logarithm of the error for the points that take it to move at all. Whether one
+    of them moves in a pass, and whether another pass follows, is decided without it."""
     passes: int
     """Most passes over a cloud."""
     query_reach: float

@@ -283,9 +283,9 @@ def test_points_without_a_ball_stay_while_others_move() -> None:
     assert result.moved[:3_000].mean() > 0.9
 
 
-@pytest.mark.parametrize("radius", [None, 0.2], ids=["balls chosen", "radius given"])
-@pytest.mark.parametrize(("margin", "moves"), [(0.4, True), (0.6, False)])
-def test_the_error_must_fall_by_the_margin(margin: float, moves: bool, radius: float | None) -> None:
+@pytest.mark.parametrize(("margin", "radius", "moves"), [(0.4, None, True), (0.6, None, False), (0.6, 0.2, True)])
+def test_the_ball_must_lower_the_error_by_the_margin(margin: float, radius: float | None, moves: bool) -> None:
+    """A radius that somebody gives is taken as it is."""
     network = saying(dict.fromkeys(CALIBRATION.balls, -0.5))
     result = filter_points(
         plane(500),
@@ -296,6 +296,13 @@ def test_the_error_must_fall_by_the_margin(margin: float, moves: bool, radius: f
     )
     assert result.moved.all() == moves
     assert result.moved.any() == moves
+
+
+def test_the_margin_is_not_asked_for_in_every_pass() -> None:
+    points = plane(500)
+    network = saying(dict.fromkeys(CALIBRATION.balls, -0.5), later=-0.1)
+    calibration = dataclasses.replace(CALIBRATION, margin=0.4)
+    assert filter_points(points, network, calibration=calibration, patch_points=50).passes == CALIBRATION.passes
 
 
 def test_the_filter_ends_when_another_pass_would_not_help() -> None:
