@@ -16,7 +16,7 @@
     └── FilteringCancelledError     cancelled               somebody asked to stop
 
 Each class has a stable `code`; the service maps codes to HTTP answers in one table (service/problems.py), the command
-line maps classes to exit codes in one table (cli.py). `hint`, where set, says what to do about it.
+line maps classes to exit codes in one table (pointfilter.cli). `hint`, where set, says what to do about it.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from training.train import TrainingSettings
+from training.settings import TrainingSettings
 
 CONFIGS = Path(__file__).parent / "configs"
 

@@ -8,7 +8,7 @@ import pytest
 from training.dataset import TrainingCloud
 from training.pools import Pools
 from training.presets import load_preset
-from training.train import TrainingSettings
+from training.settings import TrainingSettings
 
 MadePools = Callable[[int], list[TrainingCloud]]
 

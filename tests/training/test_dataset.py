@@ -24,7 +24,7 @@ from training.dataset import (
 )
 from training.network import context
 from training.pools import Pools
-from training.train import TrainingSettings
+from training.settings import TrainingSettings
 
 
 def same(a: Batch, b: Batch) -> bool:

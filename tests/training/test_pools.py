@@ -7,7 +7,7 @@ import pytest
 
 from training.dataset import TrainingCloud
 from training.pools import Pools
-from training.train import TrainingSettings
+from training.settings import TrainingSettings
 
 
 def same(a: list[TrainingCloud], b: list[TrainingCloud]) -> bool:

@@ -10,7 +10,7 @@ from torch.optim.swa_utils import AveragedModel
 from tests.training.conftest import TINY
 from training import __main__ as command
 from training.presets import load_preset, preset_names
-from training.train import TrainingSettings
+from training.settings import TrainingSettings
 
 
 def test_every_preset_loads() -> None:

@@ -19,7 +19,8 @@ from training.dataset import Batch, TrainingCloud, cut_batch
 from training.network import NetworkSettings, Pointfilter
 from training.own import as_network, own_clouds
 from training.pools import Pools
-from training.train import Run, TrainingSettings, start, training_record
+from training.settings import TrainingSettings
+from training.train import Run, start, training_record
 
 
 def weights(run: Run) -> dict[str, torch.Tensor]:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from training import shapes
-from training.shapes import KINDS, Mesh, random_shape
+from training.shapes import KINDS, Mesh, kinds, level_sets, organic, random_shape, scenes, sheets
+from training.shapes.csg import solid_of
 
 
 def check(mesh: Mesh) -> None:
@@ -34,8 +34,8 @@ def test_every_kind_gives_a_sound_mesh(kind: str, seed: int) -> None:
     np.testing.assert_array_equal(mesh.corner_normals, again.corner_normals)
 
 
-@pytest.mark.parametrize("build", [shapes._standing, shapes._room, shapes._street])
-def test_every_scene_gives_a_sound_mesh(build: shapes.Build) -> None:
+@pytest.mark.parametrize("build", [scenes._standing, scenes._room, scenes._street])
+def test_every_scene_gives_a_sound_mesh(build: kinds.Build) -> None:
     mesh = build(np.random.default_rng(0))
     assert mesh is not None
     check(mesh)
@@ -44,16 +44,14 @@ def test_every_scene_gives_a_sound_mesh(build: shapes.Build) -> None:
 def test_seeds_draw_from_the_table_and_families_share_no_shape(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[str] = []
 
-    def stand_in(kind: str) -> shapes.Build:
+    def stand_in(kind: str) -> kinds.Build:
         def build(rng: np.random.Generator) -> Mesh | None:
             drawn.append(kind)
-            return None if rng.random() < 0.1 else shapes._open_sheet(rng)
+            return None if rng.random() < 0.1 else sheets.open_sheet(rng)
 
         return build
 
-    monkeypatch.setattr(
-        shapes, "KINDS", {name: shapes.Kind(kind.weight, stand_in(name)) for name, kind in KINDS.items()}
-    )
+    monkeypatch.setattr(kinds, "KINDS", {name: kinds.Kind(kind.weight, stand_in(name)) for name, kind in KINDS.items()})
     meshes = [random_shape(seed) for seed in range(150)]
     assert set(drawn) == set(KINDS)
     share = drawn.count("detailed part") / len(drawn)
@@ -71,17 +69,17 @@ def test_marching_cubes_are_a_minor_share() -> None:
 def test_sums_of_waves_agree_on_the_grid_and_at_its_points() -> None:
     rng = np.random.default_rng(0)
     vectors, phases = rng.normal(size=(5, 3)) * 9, rng.uniform(0, 6, 5)
-    field = shapes._waves_on_grid(vectors, phases)
-    rows = rng.integers(shapes.RESOLUTION, size=(100, 3))
+    field = organic._waves_on_grid(vectors, phases)
+    rows = rng.integers(level_sets.RESOLUTION, size=(100, 3))
     places = tuple(rows.T)
-    expected = shapes._waves_at(shapes._GRID[places])(vectors, phases)
+    expected = organic._waves_at(level_sets.GRID[places])(vectors, phases)
     np.testing.assert_allclose(field[places], expected, atol=1e-9)
 
 
 def test_parallel_sheets_keep_their_gap() -> None:
     gaps = []
     for seed in range(4):
-        mesh = shapes._parallel_sheets(np.random.default_rng(seed))
+        mesh = sheets.parallel_sheets(np.random.default_rng(seed))
         assert mesh is not None
         first = mesh.vertices[: 96 * 96]
         second = mesh.vertices[96 * 96 :]
@@ -90,9 +88,9 @@ def test_parallel_sheets_keep_their_gap() -> None:
 
 
 def test_a_level_set_turns_into_a_solid() -> None:
-    distance = np.linalg.norm(shapes._GRID, axis=-1) - 0.5
-    ball = shapes._level_set(distance)
+    distance = np.linalg.norm(level_sets.GRID, axis=-1) - 0.5
+    ball = level_sets.level_set(distance)
     assert ball is not None
-    solid = shapes._solid_of(ball)
+    solid = solid_of(ball)
     radius = 0.5 / np.sqrt(3)
     assert solid.volume() == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.01)

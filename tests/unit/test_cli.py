@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pointfilter import PointCloud, __version__, cli, models
+from pointfilter.cli import filter as filter_command
 from pointfilter.errors import FilteringCancelledError, PointfilterError
 from tests.ply_files import ply_bytes
 
@@ -233,7 +234,7 @@ def test_suffixes_are_looked_at_before_the_work(
     def never(*_: object, **__: object) -> None:
         raise AssertionError("the work has begun")
 
-    monkeypatch.setattr(cli, "filter_cloud", never)
+    monkeypatch.setattr(filter_command, "filter_cloud", never)
     assert ".las" in refused(capsys, 3, "filter", noisy_file, tmp_path / "a.las")
     assert str(tmp_path / "nowhere") in refused(capsys, 5, "filter", noisy_file, tmp_path / "nowhere" / "a.ply")
 
