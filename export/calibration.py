@@ -9,10 +9,11 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from export.graph import graph_network
 from pointfilter.adaptive.calibration import Calibration
-from pointfilter.filter import Filtered, filter_points
+from pointfilter.filter import filter_points
 from pointfilter.metrics import point_to_surface
 from pointfilter.network import Network
 from training.own import UNCALIBRATED
@@ -23,9 +24,10 @@ Float64 = NDArray[np.float64]
 
 FAMILY = 2  # of shapes; training has family 0, validation family 1
 CLOUDS = 15
-POINTS = (4_000, 12_000)
 LEVELS = (0.001, 0.0025, 0.006, 0.012, 0.025)  # of the noise, in turn; fractions of the diagonal
-MEASURED_POINTS = 1_500  # of a cloud, whose distances are taken
+POINTS = (4_000, 20_000, 100_000)  # of the clouds, each with every level: noise of many spacings, and of less than one
+PIECE_POINTS = 10_000  # of a cloud, close together, that are filtered: three times as many as the largest ball holds
+MEASURED_POINTS = 1_500  # in the middle of a piece, whose distances are taken
 PREFERENCES = (-0.2, -0.1, 0.0, 0.1, 0.2)
 STILL_WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
 MARGINS = (0.0, 0.05, 0.1, 0.2, 0.3)
@@ -34,6 +36,8 @@ MOST_LOSS = 0.01  # of the error on noisy clouds, that a larger margin may cost 
 
 @dataclass(frozen=True, eq=False)
 class _Cloud:
+    """A piece (n, 3) of a noisy cloud, from its middle outwards."""
+
     noisy: Float64
     mesh: Mesh
     level: float
@@ -46,9 +50,8 @@ def calibrate(serialised: bytes, patch_points: int) -> Calibration:
 
     @cache
     def measured(calibration: Calibration) -> list[tuple[Float64, Float64]]:
-        """Distances that are left and that are expected, of every cloud."""
-        filtered = [_filtered(cloud, network, calibration, patch_points) for cloud in noisy]
-        return [(_distances(*pair), pair[1].errors[_measured(pair[1])]) for pair in zip(noisy, filtered, strict=True)]
+        """Distances that are left and that are expected in the middle of every piece."""
+        return [_measured(cloud, network, calibration, patch_points) for cloud in noisy]
 
     def cost(calibration: Calibration) -> float:
         """Mean logarithm of the distance that is left, as a share of the noise."""
@@ -72,19 +75,13 @@ def calibrate(serialised: bytes, patch_points: int) -> Calibration:
 def _cloud(number: int, level: float) -> _Cloud:
     mesh = random_shape(number, FAMILY)
     rng = np.random.default_rng([number, 0xCA1])
-    return _Cloud(scan(mesh, POINTS[number // len(LEVELS) % len(POINTS)], level, rng, plain_share=1.0), mesh, level)
+    noisy = scan(mesh, POINTS[number // len(LEVELS) % len(POINTS)], level, rng, plain_share=1.0)
+    middle = noisy[rng.integers(len(noisy))]
+    _, piece = cKDTree(noisy).query(middle, k=min(PIECE_POINTS, len(noisy)))
+    return _Cloud(noisy[piece], mesh, level)
 
 
-def _filtered(cloud: _Cloud, network: Network, calibration: Calibration, patch_points: int) -> Filtered:
-    return filter_points(cloud.noisy, network, calibration=calibration, patch_points=patch_points)
-
-
-def _distances(cloud: _Cloud, filtered: Filtered) -> Float64:
-    """Distances of the measured points to the surface: (m,) float64."""
-    return point_to_surface(filtered.points[_measured(filtered)], cloud.mesh.vertices, cloud.mesh.faces)
-
-
-def _measured(filtered: Filtered) -> NDArray[np.int64]:
-    """Rows of at most MEASURED_POINTS points, spread over the cloud."""
-    count = len(filtered.points)
-    return np.linspace(0, count - 1, min(count, MEASURED_POINTS)).astype(np.int64)
+def _measured(cloud: _Cloud, network: Network, calibration: Calibration, patch_points: int) -> tuple[Float64, Float64]:
+    filtered = filter_points(cloud.noisy, network, calibration=calibration, patch_points=patch_points)
+    left = point_to_surface(filtered.points[:MEASURED_POINTS], cloud.mesh.vertices, cloud.mesh.faces)
+    return left, filtered.errors[:MEASURED_POINTS]

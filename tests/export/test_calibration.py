@@ -10,6 +10,7 @@ from export import calibration as module
 from export.calibration import calibrate
 from export.graph import build
 from pointfilter.adaptive.calibration import Calibration
+from pointfilter.metrics import point_to_surface
 from pointfilter.network import Answers, Network
 from training.network import NetworkSettings, Pointfilter
 from training.own import UNCALIBRATED
@@ -100,8 +101,8 @@ def test_the_error_factor_makes_expected_errors_real_ones(monkeypatch: pytest.Mo
     ratios = []
     for number in range(3):
         cloud = module._cloud(number, module.LEVELS[number])
-        filtered = module._filtered(cloud, flattening, found, 32)
-        ratios.append(module._distances(cloud, filtered).mean() / filtered.errors.mean())
+        left, expected = module._measured(cloud, flattening, found, 32)
+        ratios.append(left.mean() / expected.mean())
     assert found.error_factor != 1
     assert np.exp(np.mean(np.log(ratios))) == pytest.approx(1, rel=1e-6)
 
@@ -109,7 +110,23 @@ def test_the_error_factor_makes_expected_errors_real_ones(monkeypatch: pytest.Mo
 def test_the_factor_of_a_network_that_moves_nothing_is_that_of_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     found = of(staying, monkeypatch)
     cloud = module._cloud(0, module.LEVELS[0])
-    filtered = module._filtered(cloud, staying, found, 32)
-    assert not filtered.moved.any()
-    assert np.isfinite(filtered.errors).all()
+    left, expected = module._measured(cloud, staying, found, 32)
+    before = point_to_surface(cloud.noisy[: len(left)], cloud.mesh.vertices, cloud.mesh.faces)
+    np.testing.assert_array_equal(left, before)
+    assert np.isfinite(expected).all()
     assert found.error_factor != 1
+
+
+def test_a_cloud_is_a_piece_as_dense_as_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is measured lies in the middle of the piece, where the border is far away."""
+    monkeypatch.setattr(module, "PIECE_POINTS", 100)
+    monkeypatch.setattr(module, "POINTS", (400, 40_000))
+    for number, share in ((0, 100 / 400), (len(module.LEVELS), 100 / 40_000)):
+        cloud = module._cloud(number, 0.0)
+        distances = np.linalg.norm(cloud.noisy - cloud.noisy[0], axis=1)
+        assert (np.diff(distances) >= 0).all()
+        assert len(distances) == 100
+        area = share * 0.5  # of the square
+        assert (
+            np.sqrt(area / np.pi) * 0.9 < distances[-1] < 2 * np.sqrt(area / np.pi) * 1.1
+        )  # a disc, or cut by a corner
