@@ -28,9 +28,9 @@ LEVELS = (0.001, 0.0025, 0.006, 0.012, 0.025)  # of the noise, in turn; fraction
 POINTS = (4_000, 20_000, 100_000)  # of the clouds, each with every level: noise of many spacings, and of less than one
 PIECE_POINTS = 10_000  # of a cloud, close together, that are filtered: three times as many as the largest ball holds
 MEASURED_POINTS = 1_500  # in the middle of a piece, whose distances are taken
-PREFERENCES = (-0.2, -0.1, 0.0, 0.1, 0.2)
-STILL_WEIGHTS = (0.0, 0.25, 0.5, 0.75, 1.0)
-MARGINS = (0.0, 0.05, 0.1, 0.2, 0.3)
+STILL_WEIGHTS = (0.25, 0.5, 0.75, 1.0)
+PREFERENCES = (-0.1, 0.0, 0.1)
+MARGINS = (0.0, 0.1, 0.2)
 MOST_LOSS = 0.01  # of the error on noisy clouds, that a larger margin may cost for leaving clean ones as they are
 
 
@@ -58,8 +58,9 @@ def calibrate(serialised: bytes, patch_points: int) -> Calibration:
         left = [distances.mean() for distances, _ in measured(calibration)]
         return float(np.mean(np.log(left) - np.log([cloud.level for cloud in noisy])))
 
-    chosen = min((dataclasses.replace(UNCALIBRATED, preference=preference) for preference in PREFERENCES), key=cost)
+    chosen = dataclasses.replace(UNCALIBRATED, preference=0.0)
     chosen = min((dataclasses.replace(chosen, still_weight=weight) for weight in STILL_WEIGHTS), key=cost)
+    chosen = min((dataclasses.replace(chosen, preference=preference) for preference in PREFERENCES), key=cost)
     least = cost(chosen)
     for margin in MARGINS:
         larger = dataclasses.replace(chosen, margin=margin)
