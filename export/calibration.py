@@ -29,7 +29,7 @@ POINTS = (4_000, 20_000, 100_000)  # of the clouds, each with every level: noise
 PIECE_POINTS = 10_000  # of a cloud, close together, that are filtered: three times as many as the largest ball holds
 MEASURED_POINTS = 1_500  # in the middle of a piece, whose distances are taken
 STILL_WEIGHTS = (0.25, 0.5, 0.75, 1.0)
-PREFERENCES = (-0.1, 0.0, 0.1)
+PREFERENCES = (0.0, -0.1, 0.1)  # none at a tie
 MARGINS = (0.0, 0.1, 0.2)
 MOST_LOSS = 0.01  # of the error on noisy clouds, that a larger margin may cost for leaving clean ones as they are
 
