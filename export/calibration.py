@@ -9,14 +9,13 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from export.graph import graph_network
 from pointfilter.adaptive.calibration import Calibration
 from pointfilter.filter import filter_points
 from pointfilter.metrics import point_to_surface
 from pointfilter.network import Network
-from training.own import UNCALIBRATED
+from training.own import UNCALIBRATED, rows_of_piece
 from training.scanning import scan
 from training.shapes import Mesh, random_shape
 
@@ -25,13 +24,13 @@ Float64 = NDArray[np.float64]
 FAMILY = 2  # of shapes; training has family 0, validation family 1
 CLOUDS = 15
 LEVELS = (0.001, 0.0025, 0.006, 0.012, 0.025)  # of the noise, in turn; fractions of the diagonal
-POINTS = (4_000, 20_000, 100_000)  # of the clouds, each with every level: noise of many spacings, and of less than one
-PIECE_POINTS = 10_000  # of a cloud, close together, that are filtered: three times as many as the largest ball holds
-MEASURED_POINTS = 1_500  # in the middle of a piece, whose distances are taken
+POINTS = (4_000, 20_000, 100_000)  # points in a cloud; every number is combined with every level
+PIECE_POINTS = 10_000  # only a piece of each cloud is filtered; it has three times the points of the largest ball
+MEASURED_POINTS = 1_500  # distances are measured at this many points in the middle of the piece
 STILL_WEIGHTS = (0.25, 0.5, 0.75, 1.0)
-PREFERENCES = (0.0, -0.1, 0.1)  # none at a tie
+PREFERENCES = (0.0, -0.1, 0.1)  # at a tie the first one is taken
 MARGINS = (0.0, 0.1, 0.2)
-MOST_LOSS = 0.01  # of the error on noisy clouds, that a larger margin may cost for leaving clean ones as they are
+MOST_LOSS = 0.01  # largest rise of the log error on noisy clouds that is accepted for a larger margin
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +76,7 @@ def _cloud(number: int, level: float) -> _Cloud:
     mesh = random_shape(number, FAMILY)
     rng = np.random.default_rng([number, 0xCA1])
     noisy = scan(mesh, POINTS[number // len(LEVELS) % len(POINTS)], level, rng, plain_share=1.0)
-    middle = noisy[rng.integers(len(noisy))]
-    _, piece = cKDTree(noisy).query(middle, k=min(PIECE_POINTS, len(noisy)))
-    return _Cloud(noisy[piece], mesh, level)
+    return _Cloud(noisy[rows_of_piece(noisy, PIECE_POINTS, rng)], mesh, level)
 
 
 def _measured(cloud: _Cloud, network: Network, calibration: Calibration, patch_points: int) -> tuple[Float64, Float64]:

@@ -98,9 +98,9 @@ def filter_points(
 
     radius: of all balls, in the unit of the points; by default chosen, or DEFAULT_RADIUS of the bounding-box diagonal
     in the paper's mode. iterations: most passes. patch_points: N, what the network was trained with. seed: of the
-    downsampling. threads: how many batches are evaluated at once; the result does not depend on it. normals: ask for
-    those of points that no pass looked at, too. origin: subtracted from the coordinates, by default the middle of the
-    bounding box; pieces of one cloud must share it.
+    downsampling. threads: how many batches are evaluated at once; the result does not depend on it. normals: also
+    estimate normals for points that no pass has visited. origin: subtracted from the coordinates, by default the middle
+    of the bounding box; pieces of one cloud must share it.
     progress(done, total) is called from this thread, in rows times passes, and never goes backwards. cancelled() is
     asked between batches, from any thread. after_pass(passes, points) sees the points after every pass.
 
@@ -131,7 +131,7 @@ def filter_points(
             probes = probe_balls(places.points, keys, reach, network, calibration, patch_points, key, threads, check)
             state.radii[:], _, gains, errors = probes.spread(places.points, threads)
         state.radii[np.isinf(state.radii)] = np.nan  # there is no ball
-        state.moving[gains > -calibration.margin] = False  # no ball helps there enough to touch the point
+        state.moving[gains > -calibration.margin] = False  # the best ball does not help enough
         still = np.flatnonzero(~state.moving & np.isfinite(errors))
         state.expect(still, np.log(errors[still]))
     else:

@@ -52,8 +52,7 @@ def _filtered_piece(
     number: int, cloud: TrainingCloud, network: Pointfilter, settings: DataSettings
 ) -> NDArray[np.float64]:
     rng = np.random.default_rng([settings.seed, number, 0x0E1])
-    middle = cloud.points[rng.integers(len(cloud.points))]
-    _, piece = cKDTree(cloud.points).query(middle, k=min(settings.own_points, len(cloud.points)))
+    piece = rows_of_piece(cloud.points, settings.own_points, rng)
     return filter_points(
         cloud.points[np.sort(piece)],
         as_network(network),
@@ -62,6 +61,13 @@ def _filtered_piece(
         patch_points=settings.patch_points,
         seed=number,
     ).points
+
+
+def rows_of_piece(points: NDArray[np.float64], most: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """The rows of a random one of (n, 3) points and of the points nearest to it, `most` in all, nearest first."""
+    middle = points[rng.integers(len(points))]
+    rows: NDArray[np.int64] = cKDTree(points).query(middle, k=min(most, len(points)))[1]
+    return rows
 
 
 def as_network(network: Pointfilter) -> Network:

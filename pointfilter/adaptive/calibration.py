@@ -20,8 +20,8 @@ class Calibration:
     """Balls are compared by the logarithm of the expected error, less so much of that of the error without a filter: 1
     compares shares, in which what a ball knows wrongly cancels out, 0 the errors themselves."""
     margin: float
-    """By how much a ball must lower the logarithm of the error for the points that take it to move at all. Whether one
-    of them moves in a pass, and whether another pass follows, is decided without it."""
+    """A point stays where it is unless its ball lowers the logarithm of the expected error by at least this much. Later
+    decisions, whether it moves in a given pass and whether another pass follows, do not use the margin."""
     passes: int
     """Most passes over a cloud."""
     query_reach: float
